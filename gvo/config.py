@@ -23,28 +23,16 @@ from gvo.errors import ConfigurationError, named_faults
 
 
 def _parameter(
-    default: object,
-    meaning: str,
-    unit: str = "",
-    *,
-    is_expert: bool = True,
-    ge: float | None = None,
-    gt: float | None = None,
-    le: float | None = None,
+    default: object, meaning: str, unit: str = "", *, is_expert: bool, **limits: float
 ) -> Any:  # noqa: ANN401 - pydantic types its own Field so
-    return Field(
-        default,
-        ge=ge,
-        gt=gt,
-        le=le,
-        description=meaning,
-        json_schema_extra={"unit": unit, "is_expert": is_expert},
-    )
+    shown = {"unit": unit, "is_expert": is_expert}
+    options: dict[str, Any] = {"json_schema_extra": shown, **limits}
+    return Field(default, description=meaning, **options)
 
 
-# A parameter that matters to many.
+# A parameter that matters to many, and one that hardly anyone needs.
 _common = partial(_parameter, is_expert=False)
-
+_expert = partial(_parameter, is_expert=True)
 
 Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "dcs"]
 Value: TypeAlias = bool | int | float | str | None
@@ -76,13 +64,13 @@ class SyncConfig(Section):
     stamps: Literal["header", "recording"] = _common(
         "header", "clock of the stamps of a bag's images; recording: for drivers that set none"
     )
-    queue_size: int = _parameter(
+    queue_size: int = _expert(
         100, "maximum images of a stream kept while they wait for a partner", ge=2, le=10000
     )
-    age_penalty: float = _parameter(
+    age_penalty: float = _expert(
         0.1, "share by which a later partner must be closer in time than an earlier one", ge=0
     )
-    repeated_images: Literal["skip", "keep"] = _parameter(
+    repeated_images: Literal["skip", "keep"] = _expert(
         "skip", "frames with the image of the one before; keep: for simulation without noise"
     )
 
@@ -106,15 +94,15 @@ class DepthConfig(Section):
     )
     min_depth_m: float = _common(0.3, "minimum valid depth", "m", gt=0)
     max_depth_m: float = _common(8.0, "maximum valid depth", "m", gt=0)
-    max_edge_step: float = _parameter(
+    max_edge_step: float = _expert(
         0.03, "maximum spread of depth in the window around a keypoint, relative to its depth", ge=0
     )
-    edge_radius_px: int = _parameter(2, "half size of that window", "px", ge=0, le=10)
-    virtual_baseline_m: float = _parameter(
+    edge_radius_px: int = _expert(2, "half size of that window", "px", ge=0, le=10)
+    virtual_baseline_m: float = _expert(
         0.075, "baseline of the virtual stereo camera that sees the depth as disparity", "m", gt=0
     )
-    sigma_px: float = _parameter(1.0, "standard deviation of the virtual disparity", "px", gt=0)
-    icp: Literal["auto", "always", "never"] = _parameter(
+    sigma_px: float = _expert(1.0, "standard deviation of the virtual disparity", "px", gt=0)
+    icp: Literal["auto", "always", "never"] = _expert(
         "auto", "edges of their own by ICP of depth images (klt); auto: where colour contradicts"
     )
 
@@ -131,24 +119,24 @@ class KltConfig(Section):
     """Corners tracked by Lucas-Kanade (frontend.kind: klt)."""
 
     n_corners: int = _common(250, "maximum corners per image", ge=50, le=20000)
-    min_eigenvalue: float = _parameter(
+    min_eigenvalue: float = _expert(
         1e-4, "minimum eigenvalue of a corner's gradient covariance, grey in [0, 1]", gt=0
     )
-    min_distance_px: int = _parameter(
+    min_distance_px: int = _expert(
         10, "size of the cells with at most one corner each", "px", ge=2, le=200
     )
-    cell_size_px: int = _parameter(40, "size of the cells that share the budget", "px", ge=8)
-    window_radius_px: int = _parameter(4, "half size of the tracking window", "px", ge=2, le=50)
-    n_levels: int = _parameter(2, "pyramid levels above the image, from a prediction", ge=0, le=8)
-    n_wide_levels: int = _parameter(
+    cell_size_px: int = _expert(40, "size of the cells that share the budget", "px", ge=8)
+    window_radius_px: int = _expert(4, "half size of the tracking window", "px", ge=2, le=50)
+    n_levels: int = _expert(2, "pyramid levels above the image, from a prediction", ge=0, le=8)
+    n_wide_levels: int = _expert(
         4, "pyramid levels above the image without a prediction, or after it failed", ge=0, le=8
     )
-    max_return_px: float = _parameter(0.5, "forward-backward error limit of a track", "px", gt=0)
-    pixel_sigma_px: float = _parameter(0.15, "standard deviation of a tracked pixel", "px", gt=0)
-    disparity_sigma_px: float = _parameter(
+    max_return_px: float = _expert(0.5, "forward-backward error limit of a track", "px", gt=0)
+    pixel_sigma_px: float = _expert(0.15, "standard deviation of a tracked pixel", "px", gt=0)
+    disparity_sigma_px: float = _expert(
         0.15, "standard deviation of the disparity of a corner or track, for stereo", "px", gt=0
     )
-    sigma_factor: float = _parameter(
+    sigma_factor: float = _expert(
         2.4, "largest inflation of a registration's sigmas: errors of near tracks correlate", gt=0
     )
 
@@ -156,20 +144,20 @@ class KltConfig(Section):
 class FeaturesConfig(Section):
     """Keypoints and descriptors."""
 
-    kind: Literal["orb", "sift", "fast", "gftt"] = _parameter(
+    kind: Literal["orb", "sift", "fast", "gftt"] = _expert(
         "orb", "detector: orb and sift with their own descriptors, fast and gftt with those of ORB"
     )
-    n_features: int = _parameter(1200, "maximum keypoints per image", ge=50, le=20000)
-    n_octaves: int = _parameter(1, "pyramid levels (orb)", ge=1, le=8)
-    scale_factor: float = _parameter(1.3, "scale factor between pyramid levels (orb)", gt=1, le=2)
-    fast_threshold: int = _parameter(20, "FAST threshold (orb, fast)", "grey", ge=1, le=200)
-    low_fast_threshold: int = _parameter(
+    n_features: int = _expert(1200, "maximum keypoints per image", ge=50, le=20000)
+    n_octaves: int = _expert(1, "pyramid levels (orb)", ge=1, le=8)
+    scale_factor: float = _expert(1.3, "scale factor between pyramid levels (orb)", gt=1, le=2)
+    fast_threshold: int = _expert(20, "FAST threshold (orb, fast)", "grey", ge=1, le=200)
+    low_fast_threshold: int = _expert(
         7, "FAST threshold of a second pass if the budget is not filled", "grey", ge=1, le=200
     )
-    upright: bool = _parameter(
+    upright: bool = _expert(
         True, "no orientation (orb, fast, gftt): more distinctive while the camera rolls little"
     )
-    cell_size_px: int = _parameter(40, "size of the cells that share the budget", "px", ge=8)
+    cell_size_px: int = _expert(40, "size of the cells that share the budget", "px", ge=8)
 
 
 class CameraConfig(Section):
@@ -189,36 +177,34 @@ class StereoConfig(Section):
 
     min_depth_m: float = _common(0.5, "minimum depth of a match", "m", gt=0)
     max_depth_m: float = _common(200.0, "maximum depth of a match", "m", gt=0)
-    row_tolerance_px: float = _parameter(1.5, "maximum row difference of a match", "px", ge=0)
-    max_distance: float = _parameter(
+    row_tolerance_px: float = _expert(1.5, "maximum row difference of a match", "px", ge=0)
+    max_distance: float = _expert(
         0.3, "maximum descriptor distance, relative to the largest possible", gt=0, le=1
     )
-    max_ratio: float = _parameter(
+    max_ratio: float = _expert(
         1.0, "maximum ratio of best to second-best descriptor distance; 1: no test", gt=0, le=1
     )
-    subpixel: Literal["parabola", "none"] = _parameter(
+    subpixel: Literal["parabola", "none"] = _expert(
         "parabola", "disparity by a parabola through patch differences, or from the keypoints"
     )
-    patch_radius_px: int = _parameter(5, "half size of the patches", "px", ge=1, le=20)
-    search_radius_px: int = _parameter(3, "columns searched on either side", "px", ge=1, le=20)
-    sigma_px: float = _parameter(0.3, "standard deviation of the disparity", "px", gt=0)
-    estimate_offset: bool = _parameter(
-        True, "estimate the constant disparity error of the rig online"
-    )
-    offset_sigma_px: float = _parameter(0.1, "prior standard deviation of that error", "px", gt=0)
+    patch_radius_px: int = _expert(5, "half size of the patches", "px", ge=1, le=20)
+    search_radius_px: int = _expert(3, "columns searched on either side", "px", ge=1, le=20)
+    sigma_px: float = _expert(0.3, "standard deviation of the disparity", "px", gt=0)
+    estimate_offset: bool = _expert(True, "estimate the constant disparity error of the rig online")
+    offset_sigma_px: float = _expert(0.1, "prior standard deviation of that error", "px", gt=0)
 
 
 class TemporalConfig(Section):
     """Matching of the reference and the current frame."""
 
-    radius_px: float = _parameter(20.0, "search radius around a predicted pixel", "px", gt=0)
-    wide_radius_px: float = _parameter(
+    radius_px: float = _expert(20.0, "search radius around a predicted pixel", "px", gt=0)
+    wide_radius_px: float = _expert(
         80.0, "search radius without a prediction, or after it gave too few matches", "px", gt=0
     )
-    max_distance: float = _parameter(
+    max_distance: float = _expert(
         0.25, "maximum descriptor distance, relative to the largest possible", gt=0, le=1
     )
-    max_ratio: float = _parameter(
+    max_ratio: float = _expert(
         1.0, "maximum ratio of best to second-best descriptor distance; 1: no test", gt=0, le=1
     )
 
@@ -226,37 +212,37 @@ class TemporalConfig(Section):
 class RansacConfig(Section):
     """RANSAC over minimal samples of three points."""
 
-    n_hypotheses: int = _parameter(128, "maximum number of samples", ge=1, le=100000)
-    inlier_metric: Literal["reprojection", "distance"] = _parameter(
+    n_hypotheses: int = _expert(128, "maximum number of samples", ge=1, le=100000)
+    inlier_metric: Literal["reprojection", "distance"] = _expert(
         "reprojection", "residual in the image (u, v, disparity), or distance in space"
     )
-    inlier_threshold_px: float = _parameter(3.0, "inlier threshold (reprojection)", "px", gt=0)
-    inlier_threshold_m: float = _parameter(0.3, "inlier threshold (distance)", "m", gt=0)
-    min_inliers: int = _parameter(12, "minimum number of inliers", ge=3)
-    min_disparity_px: float = _parameter(
+    inlier_threshold_px: float = _expert(3.0, "inlier threshold (reprojection)", "px", gt=0)
+    inlier_threshold_m: float = _expert(0.3, "inlier threshold (distance)", "m", gt=0)
+    min_inliers: int = _expert(12, "minimum number of inliers", ge=3)
+    min_disparity_px: float = _expert(
         12.0, "minimum disparity of a fitted point: depth noise grows with z^2", "px", ge=0
     )
-    seed: int = _parameter(0, "seed of the random generator", ge=0)
+    seed: int = _expert(0, "seed of the random generator", ge=0)
 
 
 class RegistrationConfig(Section):
     """Relative pose from 3D-3D correspondences."""
 
-    weighting: Literal["inverse_depth", "none"] = _parameter(
+    weighting: Literal["inverse_depth", "none"] = _expert(
         "inverse_depth", "weights of Umeyama's fit to the inliers: 1/z^2, or equal"
     )
-    refine: Literal["gauss_newton", "none"] = _parameter(
+    refine: Literal["gauss_newton", "none"] = _expert(
         "gauss_newton", "refinement of the pose on (u, v, disparity) residuals after RANSAC"
     )
-    n_iterations: int = _parameter(10, "maximum iterations of the refinement", ge=1, le=100)
-    huber: float = _parameter(
+    n_iterations: int = _expert(10, "maximum iterations of the refinement", ge=1, le=100)
+    huber: float = _expert(
         1.5, "threshold of the Huber kernel on the whitened residual of a match", "sigma", gt=0
     )
-    gate: float = _parameter(
+    gate: float = _expert(
         3.0, "maximum whitened residual of an inlier of the refined pose", "sigma", gt=0
     )
-    pixel_sigma_px: float = _parameter(0.7, "standard deviation of a keypoint's pixel", "px", gt=0)
-    sigma_factor: float = _parameter(
+    pixel_sigma_px: float = _expert(0.7, "standard deviation of a keypoint's pixel", "px", gt=0)
+    sigma_factor: float = _expert(
         1.2, "largest inflation of a registration's sigmas: errors of the matches correlate", gt=0
     )
 
@@ -268,53 +254,53 @@ class WindowConfig(Section):
         5, "number of recent frames in the window; null: all frames (full smoothing)", ge=2, le=1000
     )
     n_keyframes: int = _common(20, "maximum number of keyframes kept", ge=0, le=100)
-    n_links: int = _parameter(
+    n_links: int = _expert(
         3, "maximum registrations per frame, with its predecessor and keyframes", ge=1, le=20
     )
-    min_overlap: float = _parameter(
+    min_overlap: float = _expert(
         0.4, "minimum share of a keyframe's points in view to link it", ge=0, le=1
     )
-    link_gain: float = _parameter(
+    link_gain: float = _expert(
         2.0,
         "minimum number of steps since a keyframe was asked, times its share in view, to link it",
         gt=0,
     )
-    keyframe_overlap: float = _parameter(
+    keyframe_overlap: float = _expert(
         0.9, "maximum overlap with every keyframe at which a frame becomes one", ge=0, le=1
     )
-    keyframe_distance_m: float = _parameter(
+    keyframe_distance_m: float = _expert(
         1.0, "distance from all keyframes that makes a keyframe, if overlap is unknown", "m", gt=0
     )
-    keyframe_angle_deg: float = _parameter(
+    keyframe_angle_deg: float = _expert(
         15.0, "rotation from all that makes a keyframe, if overlap is unknown", "deg", gt=0, le=180
     )
-    kernel: Kernel = _parameter("huber", "robust kernel of the edges")
-    kernel_threshold: float | None = _parameter(
+    kernel: Kernel = _expert("huber", "robust kernel of the edges")
+    kernel_threshold: float | None = _expert(
         None,
         "kernel threshold on the whitened residual norm (dcs: its square); null: huber 3.55, "
         "cauchy 9.4, geman_mcclure 13.6, dcs 15.6",
         gt=0,
     )
-    gate: float | None = _parameter(
+    gate: float | None = _expert(
         10.0, "maximum disagreement with most other edges of the pose; null: any", "sigma", gt=0
     )
-    coasting_sigma_deg_per_s: float = _parameter(
+    coasting_sigma_deg_per_s: float = _expert(
         30.0, "rotation sigma of a step without registration, per second", "deg/s", gt=0
     )
-    coasting_sigma_m_per_s: float = _parameter(
+    coasting_sigma_m_per_s: float = _expert(
         3.0, "translation sigma of a step without registration, per second", "m/s", gt=0
     )
-    lost_after_s: float = _parameter(
+    lost_after_s: float = _expert(
         2.0, "time without a registration until the camera is lost and a segment begins", "s", gt=0
     )
-    zero_motion: bool = _parameter(
+    zero_motion: bool = _expert(
         False, "at standstill, add a zero-motion edge to the previous frame"
     )
-    zero_motion_flow_px: float = _parameter(1.0, "standstill: maximum median flow", "px", gt=0)
-    zero_motion_gate: float = _parameter(
+    zero_motion_flow_px: float = _expert(1.0, "standstill: maximum median flow", "px", gt=0)
+    zero_motion_gate: float = _expert(
         5.0, "standstill: maximum Mahalanobis norm of the motion", "sigma", gt=0
     )
-    zero_motion_sigma_factor: float = _parameter(
+    zero_motion_sigma_factor: float = _expert(
         1.0, "sigmas of the zero-motion edge, relative to those of the registration", gt=0
     )
 
@@ -342,70 +328,66 @@ class RuntimeConfig(Section):
 class CheckConfig(Section):
     """Samples and limits of `gvo check`."""
 
-    n_samples: int = _parameter(12, "frames sampled, each with its successor", ge=2, le=1000)
-    max_lost_share: float = _parameter(
+    n_samples: int = _expert(12, "frames sampled, each with its successor", ge=2, le=1000)
+    max_lost_share: float = _expert(
         0.05, "maximum share of frames lost: dropped, unpaired, undecodable, repeated", ge=0, le=1
     )
-    fault_lost_share: float = _parameter(0.2, "share of frames lost that is a fault", ge=0, le=1)
-    max_jitter: float = _parameter(
+    fault_lost_share: float = _expert(0.2, "share of frames lost that is a fault", ge=0, le=1)
+    max_jitter: float = _expert(
         0.3, "maximum deviation of periods from their median, 95th percentile, relative to it", ge=0
     )
-    max_gap_s: float = _parameter(
+    max_gap_s: float = _expert(
         0.5, "maximum time without a frame; above window.lost_after_s it is a fault", "s", gt=0
     )
-    max_stereo_difference_ms: float = _parameter(
+    max_stereo_difference_ms: float = _expert(
         2.0, "maximum median difference between the stamps of left and right", "ms", ge=0
     )
-    max_depth_difference_ms: float = _parameter(
+    max_depth_difference_ms: float = _expert(
         10.0, "maximum median difference between the stamps of colour and depth", "ms", ge=0
     )
-    max_clock_drift_ms_per_min: float = _parameter(
+    max_clock_drift_ms_per_min: float = _expert(
         60.0, "maximum drift of the header clock against the recording clock", "ms/min", ge=0
     )
-    max_clock_jump_ms: float = _parameter(
+    max_clock_jump_ms: float = _expert(
         100.0, "maximum jump of the header clock against the recording clock", "ms", ge=0
     )
-    max_row_offset_px: float = _parameter(
+    max_row_offset_px: float = _expert(
         0.75, "maximum median row difference of left and right; above it is a fault", "px", ge=0
     )
-    max_row_spread_px: float = _parameter(
+    max_row_spread_px: float = _expert(
         2.0, "maximum 95th percentile of the row differences; above it is a fault", "px", ge=0
     )
-    max_lens_k1: float = _parameter(
+    max_lens_k1: float = _expert(
         0.15, "maximum radial distortion k1 left in rectified images; above it is a fault", ge=0
     )
-    min_stereo_matches: int = _parameter(60, "minimum matches of left and right per frame", ge=0)
-    max_negative_share: float = _parameter(
+    min_stereo_matches: int = _expert(60, "minimum matches of left and right per frame", ge=0)
+    max_negative_share: float = _expert(
         0.1, "maximum share of negative disparities; above half: left and right swapped", ge=0, le=1
     )
-    min_depth_median_m: float = _parameter(
-        0.2, "minimum median depth at a correct scale", "m", ge=0
-    )
-    max_depth_median_m: float = _parameter(
-        50.0, "maximum median depth at a correct scale", "m", gt=0
-    )
-    min_depth_in_range: float = _parameter(
+    min_depth_median_m: float = _expert(0.2, "minimum median depth at a correct scale", "m", ge=0)
+    max_depth_median_m: float = _expert(50.0, "maximum median depth at a correct scale", "m", gt=0)
+    min_depth_in_range: float = _expert(
         0.5, "minimum share of known depth in depth.min_depth_m to depth.max_depth_m", ge=0, le=1
     )
-    max_unknown_depth: float = _parameter(0.5, "maximum share of unknown depth", ge=0, le=1)
-    min_depth_levels: int = _parameter(64, "minimum distinct values in a depth image", ge=1)
-    max_misregistration_px: float = _parameter(
+    max_unknown_depth: float = _expert(0.5, "maximum share of unknown depth", ge=0, le=1)
+    min_depth_levels: int = _expert(64, "minimum distinct values in a depth image", ge=1)
+    max_misregistration_px: float = _expert(
         3.0, "maximum offset of depth edges from colour edges; above twice: a fault", "px", ge=0
     )
-    min_brightness: float = _parameter(25.0, "minimum mean grey value", "grey", ge=0, le=255)
-    max_brightness: float = _parameter(230.0, "maximum mean grey value", "grey", ge=0, le=255)
-    max_clipped_share: float = _parameter(
+    min_brightness: float = _expert(25.0, "minimum mean grey value", "grey", ge=0, le=255)
+    max_brightness: float = _expert(230.0, "maximum mean grey value", "grey", ge=0, le=255)
+    max_clipped_share: float = _expert(
         0.3, "maximum share of black and of white pixels", ge=0, le=1
     )
-    max_exposure_ratio: float = _parameter(
+    max_exposure_ratio: float = _expert(
         1.3, "maximum ratio of the mean grey values of left and right", ge=1
     )
-    max_blur_px: float = _parameter(1.6, "maximum blur of edges, as a sigma", "px", gt=0)
-    min_corners: int = _parameter(80, "minimum corners per image (of klt.n_corners)", ge=0)
-    min_followed_share: float = _parameter(
+    max_blur_px: float = _expert(1.6, "maximum blur of edges, as a sigma", "px", gt=0)
+    min_corners: int = _expert(80, "minimum corners per image (of klt.n_corners)", ge=0)
+    min_followed_share: float = _expert(
         0.3, "minimum share of corners tracked into the next frame", ge=0, le=1
     )
-    max_tf_gap_s: float = _parameter(
+    max_tf_gap_s: float = _expert(
         0.5, "maximum time without a transform along a chain of frames", "s", gt=0
     )
 
@@ -568,8 +550,7 @@ def is_expert(field: Any) -> bool:  # noqa: ANN401 - a field of pydantic's
 
 def describe_field(field: Any) -> str:  # noqa: ANN401 - a field of pydantic's
     """Return the meaning of a parameter with its unit and range."""
-    unit = str((field.json_schema_extra or {}).get("unit", ""))
-    notes = ", ".join(filter(None, [unit, _choices(field)]))
+    notes = ", ".join(filter(None, [field.json_schema_extra["unit"], _choices(field)]))
     return f"{field.description}" + (f" [{notes}]" if notes else "")
 
 
@@ -577,12 +558,18 @@ def _choices(field: Any) -> str:  # noqa: ANN401
     choices = getattr(field.annotation, "__args__", ())
     if choices and all(isinstance(choice, str) for choice in choices):
         return " | ".join(choices)
-    signs = {"Ge": ">=", "Gt": ">", "Le": "<="}
-    return ", ".join(
-        f"{signs[type(limit).__name__]} {getattr(limit, type(limit).__name__.lower()):g}"
+    return ", ".join(f"{sign} {limit:g}" for sign, limit in _limits(field).items())
+
+
+def _limits(field: Any) -> dict[str, float]:  # noqa: ANN401
+    """Return the limits of a number by their signs."""
+    names = {"ge": ">=", "gt": ">", "le": "<="}
+    return {
+        sign: float(getattr(limit, name))
         for limit in field.metadata
-        if type(limit).__name__ in signs
-    )
+        for name, sign in names.items()
+        if hasattr(limit, name)
+    }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -635,16 +622,16 @@ def list_parameters() -> dict[str, list[Parameter]]:
 def _shown(section: str, key: str, field: Any) -> Parameter:  # noqa: ANN401
     options = get_args(field.annotation)
     default = yaml.safe_dump(field.default).splitlines()[0]
-    limits = {type(limit).__name__: limit for limit in field.metadata}
+    limits = _limits(field)
     kind = _kind(field.annotation)
-    lower, upper = _bound(limits, "Ge", "Gt"), _bound(limits, "Le")
+    lower, upper = limits.get(">=", limits.get(">")), limits.get("<=")
     start = field.default
     if start is None:
         start = _STARTS.get((section, key), 1.0)
     span = math.inf if lower is None or upper is None else upper - lower
     is_slider = kind in ("integer", "number") and span <= _WIDEST_SLIDER
     step = _step(kind, float(start) if _is_number(start) else 0.0, span)
-    if lower is not None and "Gt" in limits and (is_slider or kind == "integer"):
+    if lower is not None and ">" in limits and (is_slider or kind == "integer"):
         lower += step
     return Parameter(
         section=section,
@@ -674,11 +661,6 @@ def _kind(annotation: Any) -> Kind:  # noqa: ANN401
     plain = options[0] if options else annotation
     kinds: dict[type, Kind] = {bool: "switch", int: "integer", float: "number"}
     return kinds[plain]
-
-
-def _bound(limits: Mapping[str, Any], *names: str) -> float | None:
-    found = [getattr(limits[name], name.lower()) for name in names if name in limits]
-    return float(found[0]) if found else None
 
 
 def _step(kind: Kind, start: float, span: float) -> float:
