@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
+from typer import Argument, Option
 
 from gvo.cli import options as opt
 from gvo.cli.terminal import at_work, exit_code, is_shown, say, told_where_it_stands, warn
@@ -25,41 +26,35 @@ _MAX_WARNINGS = 20
 def batch(
     recordings: Annotated[
         list[str],
-        typer.Argument(
-            metavar="RECORDING...", help="Paths, URLs, patterns, folders, lists (.txt)."
-        ),
+        Argument(metavar="RECORDING...", help="Paths, URLs, patterns, folders, lists (.txt)."),
     ],
-    out: Annotated[str, typer.Option(metavar="DIR", help="Folder to write, or a URL.")],
+    out: Annotated[str, Option(metavar="DIR", help="Folder to write, or a URL.")],
     *,
     sweep: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="SECTION.KEY=A,B,C", help="Run each value; with several, each combination."
-        ),
+        Option(metavar="SECTION.KEY=A,B,C", help="Run each value; with several, each combination."),
     ] = None,
     configs: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             "--configs", "--config", metavar="FILE...", help="YAML files, each a configuration."
         ),
     ] = None,
     set_: opt.Settings = None,
     loops: opt.Loops = None,
     workers: Annotated[
-        int | None,
-        typer.Option(min=1, metavar="N", help="Worker processes here; one a core if omitted."),
+        int | None, Option(min=1, metavar="N", help="Worker processes here; one a core if omitted.")
     ] = None,
     scheduler: Annotated[
-        str | None,
-        typer.Option(metavar="URL", help="Scheduler of a Dask cluster, as tcp://host:8786."),
+        str | None, Option(metavar="URL", help="Scheduler of a Dask cluster, as tcp://host:8786.")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Run finished runs again.")] = False,
+    force: Annotated[bool, Option("--force", help="Run finished runs again.")] = False,
     excerpt: opt.Excerpt,
     with_report: Annotated[
-        bool, typer.Option("--report/--no-report", help="Draw the picture and page of each run.")
+        bool, Option("--report/--no-report", help="Draw the picture and page of each run.")
     ] = True,
     plots: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Write the plots as PNG and PDF too.")
+        Path | None, Option(metavar="DIR", help="Write the plots as PNG and PDF too.")
     ] = None,
     options: opt.Options,
 ) -> None:

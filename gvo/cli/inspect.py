@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from gvo.cli import options as opt
 from gvo.cli.terminal import (
@@ -20,11 +21,9 @@ from gvo.cli.terminal import (
     told_where_it_stands,
     warn,
 )
-from gvo.errors import ConfigurationError, GvoError
+from gvo.errors import GvoError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from gvo.io.recording import Source
     from gvo.trajectory.trajectory import Trajectory
 
@@ -36,7 +35,7 @@ _SIGNALS_S = 0.1
 def explain(
     recordings: opt.Recordings,
     frame: Annotated[
-        int, typer.Option("--frame", min=0, metavar="N", help="Number of the frame, from 0.")
+        int, Option("--frame", min=0, metavar="N", help="Number of the frame, from 0.")
     ],
     *,
     out: opt.Out = None,
@@ -66,13 +65,13 @@ def explain(
 def view(
     recordings: Annotated[
         list[Path],
-        typer.Argument(metavar="RECORDING...", help="Bags, a data-set folder, or a run's folder."),
+        Argument(metavar="RECORDING...", help="Bags, a data-set folder, or a run's folder."),
     ],
     *,
     host: Annotated[
-        str, typer.Option(metavar="ADDRESS", help="Where to listen; 0.0.0.0 is everywhere.")
+        str, Option(metavar="ADDRESS", help="Where to listen; 0.0.0.0 is everywhere.")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 takes a free one.")] = (
+    port: Annotated[int, Option(min=0, max=65535, help="Port; 0 takes a free one.")] = (
         _DEFAULT_PORT
     ),
     config: opt.ConfigFile = None,
@@ -87,8 +86,8 @@ def view(
         shown: Player | Path = recordings[0]
         truth: Trajectory | None = None
         if len(recordings) == 1 and (recordings[0] / "frames.csv").is_file():
-            given = {"config": config, "set": set_, **asdict(options)}
-            _refuse_for_a_run(recordings[0], given)
+            why = "is a finished run, which is shown as it was made; give the recording itself"
+            opt.refuse(f"{recordings[0]} {why}", config=config, set=set_, **asdict(options))
         else:
             reopen = partial(opt.open_source, recordings, options=options)
             player = stack.enter_context(Player(reopen, opt.load(config, set_)))
@@ -98,15 +97,6 @@ def view(
         say(f"{server.url} shows {recordings[0].name}; Ctrl-C ends")
         while not server.wait(_SIGNALS_S):
             check(None)
-
-
-def _refuse_for_a_run(folder: Path, given: Mapping[str, object]) -> None:
-    for name, value in given.items():
-        if value:
-            raise ConfigurationError(
-                f"--{name}: {folder} is a finished run, which is shown as it was made; "
-                "give the recording itself"
-            )
 
 
 def _find_truth(source: Source) -> Trajectory | None:

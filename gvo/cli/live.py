@@ -5,12 +5,13 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Literal, TypedDict
+from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import typer
+from typer import Argument, Option
 
 from gvo._text import cut
 from gvo.cli import options as opt
@@ -27,14 +28,10 @@ if TYPE_CHECKING:
     from gvo.types import Progress
 
 
-class _Address(TypedDict):
-    host: str
-    port: int
-
-
 _EVERY_S = 5.0
 _MAX_PORT = 65535
-_KINDS = ("ros1", "ros2", "camera", "-")
+_NETWORKS = ("ros1", "ros2")
+_KINDS = (*_NETWORKS, "camera", "-")
 _Sensor = Literal["stereo", "rgbd"]
 _Qos = Literal["sensor", "reliable", "system"]
 
@@ -42,45 +39,44 @@ _Qos = Literal["sensor", "reliable", "system"]
 def live(
     camera: Annotated[
         list[str],
-        typer.Argument(
+        Argument(
             metavar="CAMERA...",
             help="ros1; ros2; - for standard input; or camera and its devices: 0, a film.",
         ),
     ],
     *,
     options: opt.Options,
-    sensor: Annotated[_Sensor, typer.Option(help="What standard input gives.")] = "stereo",
+    sensor: Annotated[_Sensor, Option(help="What standard input gives.")] = "stereo",
     is_rectified: Annotated[
-        bool, typer.Option("--rectified", help="The images of - and camera are rectified already.")
+        bool, Option("--rectified", help="The images of - and camera are rectified already.")
     ] = False,
     frame: Annotated[
-        str | None, typer.Option(metavar="NAME", help="The robot's frame, such as base_link.")
+        str | None, Option(metavar="NAME", help="The robot's frame, such as base_link.")
     ] = None,
-    world: Annotated[
-        str, typer.Option(metavar="NAME", help="The fixed frame of what is sent.")
-    ] = "map",
-    with_tf: Annotated[bool, typer.Option("--tf/--no-tf", help="Send transforms.")] = True,
-    qos: Annotated[_Qos, typer.Option(help="How images are received from ROS 2.")] = "sensor",
+    world: Annotated[str, Option(metavar="NAME", help="The fixed frame of what is sent.")] = "map",
+    with_tf: Annotated[bool, Option("--tf/--no-tf", help="Send transforms.")] = True,
+    qos: Annotated[_Qos, Option(help="How images are received from ROS 2.")] = "sensor",
     foxglove: Annotated[
-        str | None, typer.Option(metavar="[HOST:]PORT", help="Serve Foxglove there, too.")
+        str | None, Option(metavar="[HOST:]PORT", help="Serve Foxglove there, too.")
     ] = None,
     view: Annotated[
-        str | None, typer.Option(metavar="[HOST:]PORT", help="Serve the page in the browser there.")
+        str | None, Option(metavar="[HOST:]PORT", help="Serve the page in the browser there.")
     ] = None,
     out: opt.Out = None,
     force: opt.Force = False,
     parameters: opt.LoopParameters,
     queue: Annotated[
-        int, typer.Option(metavar="N", help="Pairs that wait; the oldest is dropped for one more.")
+        int, Option(metavar="N", help="Pairs that wait; the oldest is dropped for one more.")
     ] = 10,
     max_lag: Annotated[
         float | None,
-        typer.Option(metavar="S", help="Drop pairs whose poses would come later, but the newest."),
+        Option(metavar="S", help="Drop pairs whose poses would come later, but the newest."),
     ] = None,
     bag: opt.Bag = None,
     with_report: opt.Report = True,
 ) -> None:
     """Track a running camera: of ROS, through a pipe, or a device."""
+    from gvo.io.poses.inputs import find_base_frame
     from gvo.live.odometry import LiveOdometry
     from gvo.runs.outputs.options import RunOutputs
 
@@ -91,9 +87,12 @@ def live(
     end = _End()
     with ExitStack() as stack, told_where_it_stands(out), ended_by_a_signal(end):
         sinks = _connect(camera, qos, foxglove, stack)
-        source, base_frame = _open(
-            camera, parameters, options, sinks, end, frame, sensor, is_rectified=is_rectified
-        )
+        kind, *devices = camera
+        if kind in _NETWORKS:
+            source, base_frame = _wait(sinks[0], parameters, options, end, frame)
+        else:
+            source = _own_camera(devices, parameters, options, sensor, is_rectified)
+            base_frame = find_base_frame(source, frame)
         make = partial(LiveOdometry, source, parameters, sinks=sinks, base_frame=base_frame)
         try:
             odometry = make(
@@ -153,66 +152,43 @@ def _connect(words: list[str], qos: _Qos, foxglove: str | None, stack: ExitStack
     if foxglove is not None:
         from gvo.live.foxglove import Foxglove
 
-        server = Foxglove(**_address("--foxglove", foxglove))
+        host, port = _address("--foxglove", foxglove)
+        server = Foxglove(host=host, port=port)
         _say(f"{server.url} serves Foxglove")
         join(server)
     return sinks
 
 
-def _address(option: str, text: str) -> _Address:
+def _address(option: str, text: str) -> tuple[str, int]:
     host, _, port = text.rpartition(":")
     if not port.isdecimal() or len(port) > 5 or int(port) > _MAX_PORT:
         raise ConfigurationError(f"{option} {cut(text, 60)}: expected [HOST:]PORT")
-    return {"host": host.strip("[]") or "127.0.0.1", "port": int(port)}
+    return host.strip("[]") or "127.0.0.1", int(port)
 
 
-def _show(odometry: LiveOdometry, source: Source, page: _Address, stack: ExitStack) -> None:
+def _show(odometry: LiveOdometry, source: Source, page: tuple[str, int], stack: ExitStack) -> None:
     """Serve the page of a run until it ends."""
     from gvo.viz.view import serve
     from gvo.viz.view.live import LivePlayer
 
     odometry.viewer = LivePlayer(source, odometry.parameters)
-    server = stack.enter_context(serve(odometry.viewer, **page))
+    server = stack.enter_context(serve(odometry.viewer, host=page[0], port=page[1]))
     warn([server.note] if server.note else [])
     _say(f"{server.url} shows the run")
 
 
-def _open(
-    words: list[str],
-    config: Config,
-    options: RecordingOptions,
-    sinks: Sequence[Sink],
-    end: _End,
-    frame: str | None,
-    sensor: _Sensor,
-    *,
-    is_rectified: bool,
+def _wait(
+    network: Sink, config: Config, options: RecordingOptions, end: _End, frame: str | None
 ) -> tuple[Source, BaseFrame]:
     """Return the camera and the frame whose poses are wanted, once all about both is known."""
     from gvo.io.poses.inputs import find_base_frame
-
-    kind, *devices = words
-    if kind in ("ros1", "ros2"):
-        transport: Transport = sinks[0]  # type: ignore[assignment]
-        return _wait(transport, config, options, end, frame)
-    source = _own_camera(devices, config, options, sensor, is_rectified=is_rectified)
-    return source, find_base_frame(source, frame)
-
-
-def _wait(
-    transport: Transport, config: Config, options: RecordingOptions, end: _End, frame: str | None
-) -> tuple[Source, BaseFrame]:
-    from gvo.io.bag.topics import TopicChoice
-    from gvo.io.poses.inputs import find_base_frame
     from gvo.live.topics import NetworkReader, TopicSource, wait_for
 
-    reader = NetworkReader(transport)
-    choice = TopicChoice(
-        left=options.left, right=options.right, color=options.color, depth=options.depth
-    )
+    reader = NetworkReader(cast("Transport", network))
 
     def find() -> tuple[Source, BaseFrame]:
-        source = TopicSource(reader, topics=choice, calibration=options.calibration, config=config)
+        calibration = options.calibration
+        source = TopicSource(reader, topics=options, calibration=calibration, config=config)
         return source, find_base_frame(source, frame)
 
     found = wait_for(find, _say, end.has_come)
@@ -224,12 +200,7 @@ def _wait(
 
 
 def _own_camera(
-    devices: list[str],
-    config: Config,
-    options: RecordingOptions,
-    sensor: _Sensor,
-    *,
-    is_rectified: bool,
+    names: list[str], config: Config, options: RecordingOptions, sensor: _Sensor, is_rectified: bool
 ) -> Source:
     from gvo.io.calibration.files import paths_of
     from gvo.io.frames import Rig
@@ -239,8 +210,8 @@ def _own_camera(
     if not 1 <= len(files) <= 2:
         raise ConfigurationError(f"expected one or two --calibration, got {len(files)}")
     rig = Rig(*files, sensor=sensor, is_rectified=is_rectified)
-    if devices:
-        return Device(devices, rig.info)
+    if names:
+        return Device(names, rig.info)
     return StandardInput(sys.stdin.buffer, rig.info, config, depth_scale=rig.depth_scale)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+from typer import Argument, Option
 from typer.main import get_command
 
 from gvo._text import plain_number
@@ -52,7 +53,7 @@ _command = partial(opt.add_command, app)
 # What is refused of a command line; Typer gives the class no name of its own.
 _UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
-_AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+_AsJson = Annotated[bool, Option("--json", help="Print JSON.")]
 _Robust = Literal["none", "huber", "gnc"]
 _KeyframePolicy = Literal["distance", "manual"]
 _Layout = Literal["bag", "kitti", "euroc", "tum"]
@@ -69,10 +70,7 @@ def _print_version(value: bool) -> None:
 def _options(
     context: typer.Context,
     version: Annotated[
-        bool,
-        typer.Option(
-            "--version", callback=_print_version, is_eager=True, help="Print the version."
-        ),
+        bool, Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     """Take the options that stand before a command; without one, show what there is."""
@@ -83,7 +81,7 @@ def _options(
 
 @_command()
 def demo(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")] = Path("gvo-demo"),
+    out: Annotated[Path, Option(metavar="DIR", help="Folder to write.")] = Path("gvo-demo"),
 ) -> None:
     """Render a drive as a bag, run on it, compare with the truth."""
     from gvo.runs.demo import BAG_NAME, run_demo
@@ -105,32 +103,32 @@ def run(
     parameters: opt.LoopParameters,
     excerpt: opt.Excerpt,
     frame: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Frame of tf whose poses are written.")
+        str | None, Option(metavar="NAME", help="Frame of tf whose poses are written.")
     ] = None,
     initial_pose: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="POSE", help="Pose of the first frame: X,Y,Z[,QX,QY,QZ,QW] in metres, or truth."
         ),
     ] = None,
     ground_truth: Annotated[
         str | None,
-        typer.Option(metavar="WHAT", help="File of poses, or in the bag: tf:PARENT:CHILD, /TOPIC."),
+        Option(metavar="WHAT", help="File of poses, or in the bag: tf:PARENT:CHILD, /TOPIC."),
     ] = None,
     bag: opt.Bag = None,
     world: Annotated[
-        str, typer.Option(metavar="NAME", help="The fixed frame in that bag, such as odom or map.")
+        str, Option(metavar="NAME", help="The fixed frame in that bag, such as odom or map.")
     ] = "world",
     overlay: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Film the matches: .webm, .mp4, or a folder of PNG."),
+        Option(metavar="FILE", help="Film the matches: .webm, .mp4, or a folder of PNG."),
     ] = None,
     rerun: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write a .rrd for the Rerun viewer.")
+        Path | None, Option(metavar="FILE", help="Write a .rrd for the Rerun viewer.")
     ] = None,
     with_report: opt.Report = True,
     plots: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Write each plot as PNG and PDF too.")
+        Path | None, Option(metavar="DIR", help="Write each plot as PNG and PDF too.")
     ] = None,
     options: opt.Options,
 ) -> None:
@@ -176,7 +174,7 @@ def check_(
     *,
     parameters: opt.Parameters,
     frame: Annotated[
-        str, typer.Option(metavar="NAME", help="The robot's base frame in tf.")
+        str, Option(metavar="NAME", help="The robot's base frame in tf.")
     ] = "base_link",
     options: opt.Options,
     as_json: _AsJson = False,
@@ -203,7 +201,7 @@ def check_(
 def smooth(
     inputs: Annotated[
         list[str],
-        typer.Argument(
+        Argument(
             metavar="INPUT...", help="g2o pose graph, files of poses, bag; - for lines of stdin."
         ),
     ],
@@ -211,29 +209,29 @@ def smooth(
     force: opt.Force = False,
     topic: Annotated[
         list[str] | None,
-        typer.Option("--topic", metavar="TOPIC", help="Poses in a bag; repeatable: fused."),
+        Option("--topic", metavar="TOPIC", help="Poses in a bag; repeatable: fused."),
     ] = None,
     sigma: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             "--sigma", metavar="DEG,M", help="Noise of a step; one for all inputs, or one each."
         ),
     ] = None,
     ground_truth: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="True poses: TUM, KITTI, EuRoC.")
+        Path | None, Option(metavar="FILE", help="True poses: TUM, KITTI, EuRoC.")
     ] = None,
     robust: Annotated[
         _Robust | None,
-        typer.Option(help="Against false edges; default: none for a graph, huber for poses."),
+        Option(help="Against false edges; default: none for a graph, huber for poses."),
     ] = None,
     covariances: Annotated[
-        bool, typer.Option("--covariances", help="Of all poses, which takes longer than them.")
+        bool, Option("--covariances", help="Of all poses, which takes longer than them.")
     ] = False,
     window: Annotated[
-        bool, typer.Option("--window", help="Smooth a file by the window, as a stream of lines.")
+        bool, Option("--window", help="Smooth a file by the window, as a stream of lines.")
     ] = False,
     keyframes: Annotated[
-        _KeyframePolicy | None, typer.Option(help="Which poses stay in the window.")
+        _KeyframePolicy | None, Option(help="Which poses stay in the window.")
     ] = None,
     config: opt.ConfigFile = None,
     set_: opt.Settings = None,
@@ -246,12 +244,12 @@ def smooth(
     if is_stream and len(inputs) > 1:
         raise ConfigurationError("-: standard input does not go with another input")
     if is_stream:
-        _refuse("does not go with standard input", topic=topic, sigma=sigma)
+        opt.refuse("does not go with standard input", topic=topic, sigma=sigma)
     if window or is_stream:
         why = "is of a file optimized at once, not of the window"
-        _refuse(why, robust=robust, covariances=covariances)
+        opt.refuse(why, robust=robust, covariances=covariances)
     else:
-        _refuse("is of the window; add --window", config=config, set=set_, keyframes=keyframes)
+        opt.refuse("is of the window; add --window", config=config, set=set_, keyframes=keyframes)
     parameters = opt.load(config, set_)
     out = opt.new_folder(out, "lines" if is_stream else inputs[0], force=force)
     truth = None if ground_truth is None else read_ground_truth(ground_truth)
@@ -293,39 +291,27 @@ def _answer(line: str) -> None:
     sys.stdout.flush()
 
 
-def _refuse(why: str, **options: object) -> None:
-    for name, given in options.items():
-        if given:
-            raise ConfigurationError(f"--{name}: {why}")
-
-
 @_command()
 def compare(
     reference: Annotated[
         str,
-        typer.Argument(
-            help="File (TUM, KITTI, EuRoC), recording, or BAG#tf:PARENT:CHILD, BAG#TOPIC."
-        ),
+        Argument(help="File (TUM, KITTI, EuRoC), recording, or BAG#tf:PARENT:CHILD, BAG#TOPIC."),
     ],
-    estimates: Annotated[list[str], typer.Argument(help="Files of poses, or BAG#..., likewise.")],
-    align: Annotated[_Align, typer.Option(help="How the estimates are aligned.")] = "se3",
+    estimates: Annotated[list[str], Argument(help="Files of poses, or BAG#..., likewise.")],
+    align: Annotated[_Align, Option(help="How the estimates are aligned.")] = "se3",
     segments: Annotated[
-        str | None,
-        typer.Option(metavar="L,...", help="Segment lengths in m; 100,...,800 or 20,50."),
+        str | None, Option(metavar="L,...", help="Segment lengths in m; 100,...,800 or 20,50.")
     ] = None,
     segment_step: Annotated[
-        int | None,
-        typer.Option(min=1, metavar="N", help="Start a segment at every Nth pose; 10 or 1."),
+        int | None, Option(min=1, metavar="N", help="Start a segment at every Nth pose; 10 or 1.")
     ] = None,
     as_json: _AsJson = False,
-    plot: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Draw a .png, .pdf or .svg.")
-    ] = None,
+    plot: Annotated[Path | None, Option(metavar="FILE", help="Draw a .png, .pdf or .svg.")] = None,
     report_file: Annotated[
-        Path | None, typer.Option("--report", metavar="FILE", help="Write a page, .html.")
+        Path | None, Option("--report", metavar="FILE", help="Write a page, .html.")
     ] = None,
     plots: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Write its plots as PNG and PDF too.")
+        Path | None, Option(metavar="DIR", help="Write its plots as PNG and PDF too.")
     ] = None,
     force: opt.Force = False,
 ) -> None:
@@ -365,13 +351,11 @@ def compare(
 @_command("convert")
 def convert_(
     recordings: opt.Recordings,
-    target: Annotated[Path, typer.Argument(help=".bag, .mcap, .db3, or a folder to make.")],
+    target: Annotated[Path, Argument(help=".bag, .mcap, .db3, or a folder to make.")],
     *,
-    layout: Annotated[
-        _Layout | None, typer.Option(help="Layout of the folder that is written.")
-    ] = None,
-    rectify: Annotated[bool, typer.Option("--rectify", help="Rectify the images.")] = False,
-    png: Annotated[bool, typer.Option("--png", help="Compress the images of a bag.")] = False,
+    layout: Annotated[_Layout | None, Option(help="Layout of the folder that is written.")] = None,
+    rectify: Annotated[bool, Option("--rectify", help="Rectify the images.")] = False,
+    png: Annotated[bool, Option("--png", help="Compress the images of a bag.")] = False,
     options: opt.Options,
     parameters: opt.Parameters,
 ) -> None:
@@ -403,7 +387,7 @@ def convert_(
 def config_(
     *,
     everything: Annotated[
-        bool, typer.Option("--all", help="Print the parameters for experts too.")
+        bool, Option("--all", help="Print the parameters for experts too.")
     ] = False,
     parameters: opt.Parameters,
 ) -> None:

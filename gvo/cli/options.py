@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
+from typer import Argument, Option
 
 from gvo.cli.terminal import Command, Verbose
+from gvo.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from gvo.config import Config
@@ -20,30 +22,27 @@ if TYPE_CHECKING:
 _LOGGER = logging.getLogger(__name__)
 Settings = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Change a parameter; repeatable."),
+    Option("--set", metavar="SECTION.KEY=VALUE", help="Change a parameter; repeatable."),
 ]
 ConfigFile = Annotated[
-    Path | None, typer.Option("--config", metavar="FILE", help="YAML, see `gvo config`.")
+    Path | None, Option("--config", metavar="FILE", help="YAML, see `gvo config`.")
 ]
 Loops = Annotated[
-    bool | None,
-    typer.Option("--loops/--no-loops", help="Find loops, write global poses; loops.enabled."),
+    bool | None, Option("--loops/--no-loops", help="Find loops, write global poses; loops.enabled.")
 ]
 Recordings = Annotated[
-    list[Path], typer.Argument(metavar="RECORDING...", help="Bags, or one data-set folder.")
+    list[Path], Argument(metavar="RECORDING...", help="Bags, or one data-set folder.")
 ]
 Out = Annotated[
-    Path | None, typer.Option(metavar="DIR", help="Folder to write; gvo-RECORDING if omitted.")
+    Path | None, Option(metavar="DIR", help="Folder to write; gvo-RECORDING if omitted.")
 ]
-Force = Annotated[bool, typer.Option("--force", help="Replace earlier results.")]
+Force = Annotated[bool, Option("--force", help="Replace earlier results.")]
 Bag = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="Write a .mcap (ROS 2) or .bag (ROS 1) too.")
+    Path | None, Option(metavar="FILE", help="Write a .mcap (ROS 2) or .bag (ROS 1) too.")
 ]
-Report = Annotated[
-    bool, typer.Option("--report/--no-report", help="Draw the picture and report.html.")
-]
-Start = Annotated[float, typer.Option(metavar="S", help="Seconds to skip at the start.")]
-Every = Annotated[int, typer.Option(metavar="N", help="Take every Nth frame.")]
+Report = Annotated[bool, Option("--report/--no-report", help="Draw the picture and report.html.")]
+Start = Annotated[float, Option(metavar="S", help="Seconds to skip at the start.")]
+Every = Annotated[int, Option(metavar="N", help="Take every Nth frame.")]
 
 
 class _Group(NamedTuple):
@@ -107,7 +106,7 @@ def _load_with_loops(
 def _make_excerpt(
     start: Start = 0.0,
     duration: Annotated[
-        float | None, typer.Option(metavar="S", help="Seconds to read from there.")
+        float | None, Option(metavar="S", help="Seconds to read from there.")
     ] = None,
     every: Every = 1,
 ) -> "_Excerpt":
@@ -117,13 +116,13 @@ def _make_excerpt(
 
 
 def _topic(images: str) -> Any:  # noqa: ANN401 - has no public type
-    return typer.Option(metavar="TOPIC", help=f"Topic of the {images} images.")
+    return Option(metavar="TOPIC", help=f"Topic of the {images} images.")
 
 
 def _recording_options(
     calibration: Annotated[
         list[Path] | None,
-        typer.Option(
+        Option(
             metavar="FILE", help="ROS, Kalibr or EuRoC YAML, repeatable; replaces the recording's."
         ),
     ] = None,
@@ -154,6 +153,13 @@ def new_folder(
     folder = free_folder(recording, what) if out is None else out
     check_unused(folder, force=force)
     return folder
+
+
+def refuse(why: str, **options: object) -> None:
+    """Refuse the first option that was given."""
+    for name, given in options.items():
+        if given:
+            raise ConfigurationError(f"--{name}: {why}")
 
 
 def open_source(

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, NoReturn, TextIO
 
 import typer
+from typer import Option
 from typer.core import TyperCommand
 
 from gvo._text import cut, visible
@@ -45,7 +46,7 @@ def _set_verbosity(value: bool | None) -> None:
 
 Verbose = Annotated[
     bool | None,
-    typer.Option(
+    Option(
         "--verbose/--quiet",
         "-v/-q",
         callback=_set_verbosity,
