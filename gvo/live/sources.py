@@ -15,7 +15,6 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, BinaryIO
 
@@ -33,6 +32,8 @@ from gvo.io.bag.messages import (
     decode_depth,
     decode_grey_or_color,
 )
+from gvo.io.bag.reader import typestore
+from gvo.io.bag.topics import COMPRESSED_TYPE, IMAGE_TYPE
 from gvo.io.images import MILLIMETRES, GreyRange, check_size
 from gvo.io.recording import RecordingInfo, StampedImage
 from gvo.trajectory.trajectory import Trajectory
@@ -44,28 +45,6 @@ _SIZES = ("width", "height")
 _MAX_LINE = 1 << 16
 _MAX_COMPRESSED = 1 << 28
 _N_SHOWN = 80
-
-
-@dataclass(slots=True, kw_only=True)
-class _Raw:
-    """An image as `sensor_msgs/Image` has it."""
-
-    height: int
-    width: int
-    encoding: str
-    step: int
-    data: NDArray[np.uint8]
-    is_bigendian: int = 0
-    header: Any = None
-
-
-@dataclass(slots=True, kw_only=True)
-class _Compressed:
-    """An image as `sensor_msgs/CompressedImage` has it."""
-
-    format: str
-    data: NDArray[np.uint8] = field(repr=False)
-    header: Any = None
 
 
 class StandardInput:
@@ -131,7 +110,7 @@ class StandardInput:
         """Read the bytes of an image, and return what decodes them."""
         if "format" in header:
             size = _whole(header, "size", lowest=0, highest=_MAX_COMPRESSED)
-            packed = _Compressed(format=str(header["format"]), data=self._read(size))
+            packed = _message(COMPRESSED_TYPE, format=str(header["format"]), data=self._read(size))
             if is_depth:
                 return partial(decode_compressed_depth, packed, self._scale, _WHERE)
             return partial(decode_compressed, packed, _WHERE, self._grey_range)
@@ -140,20 +119,27 @@ class StandardInput:
             return partial(decode_depth, raw, self._scale, _WHERE)
         return partial(decode_grey_or_color, raw, _WHERE, self._grey_range)
 
-    def _read_raw(self, header: dict[str, Any], *, is_depth: bool) -> _Raw:
+    def _read_raw(self, header: dict[str, Any], *, is_depth: bool) -> Any:  # noqa: ANN401
         width, height = (_whole(header, name, lowest=1, highest=1 << 20) for name in _SIZES)
         check_size(width, height, _WHERE)
         name = str(header.get("encoding", ""))
         encoding = find_encoding(name, DEPTHS if is_depth else IMAGES, _WHERE)
         step = width * encoding.n_channels * np.dtype(encoding.dtype).itemsize
         data = self._read(step * height * encoding.rows_per_two // 2)
-        return _Raw(height=height, width=width, encoding=name, step=step, data=data)
+        fields = {"encoding": name, "is_bigendian": 0, "step": step, "data": data}
+        return _message(IMAGE_TYPE, height=height, width=width, **fields)
 
     def _read(self, size: int) -> NDArray[np.uint8]:
         data = self._stream.read(size)
         if len(data) < size:
             raise RecordingError(f"{_WHERE}: ends after {len(data)} of {size} bytes of an image")
         return np.frombuffer(data, dtype=np.uint8)
+
+
+def _message(type_: str, **fields: object) -> Any:  # noqa: ANN401 - made at run time
+    """Return a message of ROS 2 without a header."""
+    make_message: Callable[..., Any] = typestore(is_ros1=False).types[type_]
+    return make_message(header=None, **fields)
 
 
 def _parse(line: bytes) -> dict[str, Any]:

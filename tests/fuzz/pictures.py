@@ -43,7 +43,7 @@ def _raw_image(data: bytes) -> None:
     n_bytes = min(step * rows, 1 << 20) if is_true else choices.below(4096)
     start = choices.rest
     content = (start * (n_bytes // max(len(start), 1) + 1))[:n_bytes] if start else bytes(n_bytes)
-    message = SimpleNamespace(
+    message: Any = SimpleNamespace(
         encoding=encoding,
         height=height,
         width=width,
@@ -70,7 +70,7 @@ def _encoded_image(data: bytes) -> None:
     choices = Choices(data)
     number, is_depth = choices.below(len(_FORMATS)), choices.below(2) == 1
     content = np.frombuffer(choices.rest, dtype=np.uint8)
-    message = SimpleNamespace(format=_FORMATS[number], data=content)
+    message: Any = SimpleNamespace(format=_FORMATS[number], data=content)
     if is_depth:
         decode_compressed_depth(message, 1000.0, "/depth")
     else:

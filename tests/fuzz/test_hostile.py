@@ -78,7 +78,7 @@ def pixels_of(data: bytes) -> NDArray[np.uint8]:
     return np.frombuffer(data, dtype=np.uint8)
 
 
-def compressed(data: bytes, format_: str = "png") -> SimpleNamespace:
+def compressed(data: bytes, format_: str = "png") -> Any:
     return SimpleNamespace(format=format_, data=pixels_of(data))
 
 

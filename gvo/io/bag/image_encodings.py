@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from array import array
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -16,23 +16,15 @@ from gvo.errors import RecordingError
 from gvo.io.images import check_size
 from gvo.types import IntArray
 
+if TYPE_CHECKING:
+    from rosbags.typesys.stores.ros2_humble import sensor_msgs__msg__Image as RawImage
+
 MAX_RVL_PIXELS = 1 << 24
 """More than any depth camera has; to decode a pixel takes a hundred times its memory."""
 _SIZE = struct.Struct("<II")
 _MAX_NUMBERS_PER_PIXEL = 3  # a run of one value, behind none: two lengths and the value
 _MAX_NIBBLES = 64  # of a number; three make a depth
 _BLOCK_WORDS = 1 << 18
-
-
-class RawImage(Protocol):
-    """What `sensor_msgs/Image` says of its pixels."""
-
-    height: int
-    width: int
-    encoding: str
-    is_bigendian: int
-    step: int
-    data: NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,10 +66,8 @@ BAYER = (
 """Mosaics of colour filters."""
 
 IMAGES = {
-    "mono8": Encoding("u1", 1),
-    "8UC1": Encoding("u1", 1),
-    "mono16": Encoding("u2", 1),
-    "16UC1": Encoding("u2", 1),
+    **dict.fromkeys(("mono8", "8UC1"), Encoding("u1", 1)),
+    **dict.fromkeys(("mono16", "16UC1"), Encoding("u2", 1)),
     **_of_both_depths("bgr", 3, None),
     **_of_both_depths("rgb", 3, cv2.COLOR_RGB2BGR),
     **_of_both_depths("bgra", 4, None),
@@ -88,10 +78,8 @@ IMAGES = {
     "16UC3": Encoding("u2", 3),
     "16UC4": Encoding("u2", 4),
     **BAYER,
-    "yuv422": Encoding("u1", 2, cv2.COLOR_YUV2BGR_UYVY),
-    "uyvy": Encoding("u1", 2, cv2.COLOR_YUV2BGR_UYVY),
-    "yuv422_yuy2": Encoding("u1", 2, cv2.COLOR_YUV2BGR_YUYV),
-    "yuyv": Encoding("u1", 2, cv2.COLOR_YUV2BGR_YUYV),
+    **dict.fromkeys(("yuv422", "uyvy"), Encoding("u1", 2, cv2.COLOR_YUV2BGR_UYVY)),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), Encoding("u1", 2, cv2.COLOR_YUV2BGR_YUYV)),
     "nv12": Encoding("u1", 1, cv2.COLOR_YUV2BGR_NV12, 3),
     "nv21": Encoding("u1", 1, cv2.COLOR_YUV2BGR_NV21, 3),
 }

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 import struct
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gvo._text import cut
@@ -17,7 +16,6 @@ from gvo.io.bag.image_encodings import (
     BAYER,
     DEPTHS,
     IMAGES,
-    RawImage,
     convert_to_bgr,
     decode_rvl,
     find_encoding,
@@ -37,39 +35,14 @@ from gvo.io.poses.tf_paths import bare
 from gvo.trajectory.formats import MAX_POSITION_M
 from gvo.types import DepthArray, Failure, FloatArray, ImageArray
 
+if TYPE_CHECKING:
+    from rosbags.typesys.stores import ros2_humble as ros
+
 _NORM_TOLERANCE = 1e-2  # of quaternions
 _COMPRESSED_DEPTH_HEADER = struct.Struct("<iff")
 
 
-class StampMessage(Protocol):
-    """`builtin_interfaces/Time`."""
-
-    sec: int
-    nanosec: int
-
-
-class HeaderMessage(Protocol):
-    """`std_msgs/Header`."""
-
-    stamp: StampMessage
-    frame_id: str
-
-
-class ImageMessage(RawImage, Protocol):
-    """`sensor_msgs/Image`."""
-
-    header: HeaderMessage
-
-
-class CompressedImageMessage(Protocol):
-    """`sensor_msgs/CompressedImage`."""
-
-    header: HeaderMessage
-    format: str
-    data: NDArray[np.uint8]
-
-
-def stamp_of(header: HeaderMessage) -> int:
+def stamp_of(header: ros.std_msgs__msg__Header) -> int:
     """Return the stamp of a header in nanoseconds.
 
     Parameters
@@ -108,7 +81,7 @@ def transform_of(translation: Any, rotation: Any) -> FloatArray | Failure:  # no
 
 
 def decode_grey_or_color(
-    message: ImageMessage, where: str, grey_range: GreyRange = FULL_RANGE
+    message: ros.sensor_msgs__msg__Image, where: str, grey_range: GreyRange = FULL_RANGE
 ) -> ImageArray:
     """Return the pixels of an `Image` message.
 
@@ -139,7 +112,7 @@ def decode_grey_or_color(
     return to_8_bit(pixels, where, grey_range)
 
 
-def decode_depth(message: ImageMessage, scale: float, where: str) -> DepthArray:
+def decode_depth(message: ros.sensor_msgs__msg__Image, scale: float, where: str) -> DepthArray:
     """Return metres (h, w), NaN = unknown, of an `Image` message of depth.
 
     Parameters
@@ -164,7 +137,7 @@ def decode_depth(message: ImageMessage, scale: float, where: str) -> DepthArray:
 
 
 def decode_compressed(
-    message: CompressedImageMessage, where: str, grey_range: GreyRange = FULL_RANGE
+    message: ros.sensor_msgs__msg__CompressedImage, where: str, grey_range: GreyRange = FULL_RANGE
 ) -> ImageArray:
     """Return the pixels of a `CompressedImage` message.
 
@@ -202,7 +175,7 @@ def decode_compressed(
 
 
 def decode_compressed_depth(
-    message: CompressedImageMessage, scale: float, where: str
+    message: ros.sensor_msgs__msg__CompressedImage, scale: float, where: str
 ) -> DepthArray:
     """Return metres (h, w), NaN = unknown, of a `CompressedImage` message of depth.
 
