@@ -99,20 +99,19 @@ def calibrations_of_messages(
     if second is not None and topics.sensor == "stereo":
         pair, baseline = _stereo_pair(reader, (first, second), where)
         names = f"{first.info_name} + {second.info_name}"
-        decisions = (f"calibration: {names}; the images are {state}", *first.notes, *second.notes)
-        return BagCalibration(
-            calibrations=pair, decisions=(*decisions, baseline), frame_id=frame_id
-        )
+        line = f"calibration: {names}; the images are {state}"
+        decisions = (line, *first.notes, *second.notes, baseline)
+        return BagCalibration(calibrations=pair, decisions=decisions, frame_id=frame_id)
     decisions = (f"calibration: {first.info_name}; the images are {state}", *first.notes)
     color = make_rgbd_calibration(first.fields, is_rectified=is_rectified)
-    choice = DepthChoice()
+    view, found = None, ""
     if second is not None:
-        choice = choose_depth_view(reader, (first, color), second)
+        view, found = choose_depth_view(reader, (first, color), second)
     return BagCalibration(
         calibrations=(color,),
-        decisions=(*decisions, *choice.decisions),
+        decisions=(*decisions, found) if found else decisions,
         depth_scale=recorded_depth_scale(reader, topics.second),
-        depth_view=choice.view,
+        depth_view=view,
         frame_id=frame_id,
     )
 
@@ -180,25 +179,9 @@ def _stereo_pair(
     return pair, f"baseline: {baseline:.4f} m from {found.origin}"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DepthChoice:
-    """How depth gets to colour.
-
-    Parameters
-    ----------
-    view : DepthView, optional
-        Of depth that has to be registered; None where it is, or where that is not known.
-    decisions : tuple of str
-        What was found, a line each.
-    """
-
-    view: DepthView | None = None
-    decisions: tuple[str, ...] = ()
-
-
 def choose_depth_view(
     reader: MessageReader, color: tuple[BagCamera, Calibration], depth: BagCamera
-) -> DepthChoice:
+) -> tuple[DepthView | None, str]:
     """Tell whether depth has to be registered to colour.
 
     It is registered already where the name of the topic says so, and where both cameras have one
@@ -213,36 +196,41 @@ def choose_depth_view(
     depth : BagCamera
         The camera that the `CameraInfo` of the depth describes.
 
+    Returns
+    -------
+    DepthView, optional
+        Of depth that has to be registered; None where it is, or where that is not known.
+    str
+        What was found, a line; empty where there is nothing to say.
+
     Raises
     ------
     RecordingError
         When the bag cannot be read.
     """
     if _REGISTERED.search(depth.image.base.lower()):
-        return DepthChoice()
+        return None, ""
     camera, color_calibration = color
     try:
         calibration = make_rgbd_calibration(depth.fields, is_rectified=depth.image.is_rectified)
     except CalibrationError as error:
-        return DepthChoice(decisions=(f"depth: taken as registered to colour: {error}",))
+        return None, f"depth: taken as registered to colour: {error}"
     difference = _difference(color_calibration, calibration)
     frames = (camera.fields.frame_id, depth.fields.frame_id)
     if frames[0] and frames[0] == frames[1]:
-        found: Extrinsics | Failure = Extrinsics(
-            T_target_source=np.eye(4), origin=f"one frame {frames[0]}"
-        )
+        origin = f"one frame {frames[0]}"
+        found: Extrinsics | Failure = Extrinsics(T_target_source=np.eye(4), origin=origin)
     else:
         found = find_extrinsics(reader, camera, depth)
     if isinstance(found, Failure):
-        return DepthChoice(decisions=_advice(difference, frames, found))
+        return None, _advice(difference, frames, found)
     if not difference and np.allclose(found.T_target_source, np.eye(4), atol=_SAME_PLACE_M):
-        return DepthChoice()
+        return None, ""
     distance = float(np.linalg.norm(found.T_target_source[:3, 3]))
     line = f"depth: of a camera {distance:.4f} m from colour by {found.origin}, registered to it"
     if difference:
         line += f" ({difference})"
-    view = DepthView(calibration=calibration, T_color_depth=found.T_target_source)
-    return DepthChoice(view=view, decisions=(line,))
+    return DepthView(calibration=calibration, T_color_depth=found.T_target_source), line
 
 
 def _difference(color: Calibration, depth: Calibration) -> str:
@@ -250,18 +238,12 @@ def _difference(color: Calibration, depth: Calibration) -> str:
     if (depth.width, depth.height) != (color.width, color.height):
         return f"images of {depth.width}x{depth.height} pixels, colour {color.width}x{color.height}"
     first, second = color.pinhole(), depth.pinhole()
-    for name, limit in (
-        ("fx", _TOLERANCE * first.fx),
-        ("fy", _TOLERANCE * first.fy),
-        ("cx", _TOLERANCE * first.width),
-        ("cy", _TOLERANCE * first.height),
-    ):
+    sizes = {"fx": first.fx, "fy": first.fy, "cx": first.width, "cy": first.height}
+    for name, size in sizes.items():
         of_color, of_depth = float(getattr(first, name)), float(getattr(second, name))
-        if abs(of_depth - of_color) > limit:
+        if abs(of_depth - of_color) > _TOLERANCE * size:
             return f"{name} {of_depth:.1f} against {of_color:.1f} px"
-    if not _is_one_lens(color, depth):
-        return "another lens"
-    return ""
+    return "" if _is_one_lens(color, depth) else "another lens"
 
 
 def _is_one_lens(color: Calibration, depth: Calibration) -> bool:
@@ -273,15 +255,15 @@ def _is_one_lens(color: Calibration, depth: Calibration) -> bool:
     return all(np.allclose(a, b, atol=_SAME_PIXEL_PX) for a, b in zip(*maps, strict=True))
 
 
-def _advice(difference: str, frames: tuple[str, str], why: Failure) -> tuple[str, ...]:
+def _advice(difference: str, frames: tuple[str, str], why: Failure) -> str:
     if difference:
-        return (f"depth: it is not registered to colour ({difference}; {why.reason}): {_REMEDY}",)
+        return f"depth: it is not registered to colour ({difference}; {why.reason}): {_REMEDY}"
     if all(frames):
         return (
             f"depth: taken as registered to colour, though its frame is {frames[1]} and that of "
-            f"colour {frames[0]} ({why.reason}); if it is not, {_REMEDY}",
+            f"colour {frames[0]} ({why.reason}); if it is not, {_REMEDY}"
         )
-    return ()
+    return ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -203,10 +203,9 @@ class _Seen:
 
 
 def _counts(reader: _Reader) -> dict[Channel, int]:
-    counts: dict[Channel, int] = {}
+    counts: Counter[Channel] = Counter()
     for connection in reader.connections:
-        channel = _channel(connection, reader)
-        counts[channel] = counts.get(channel, 0) + connection.msgcount
+        counts[_channel(connection, reader)] += connection.msgcount
     return counts
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 import weakref
+from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -208,11 +209,10 @@ def _begin(file: BagFile, names: Collection[str]) -> Iterator[tuple[int, FoundMe
 
 
 def _merge_topics(files: Sequence[BagFile]) -> list[Topic]:
-    counts: dict[tuple[str, str], int] = {}
+    counts: Counter[tuple[str, str]] = Counter()
     for file in files:
         for channel, count in file.counts.items():
-            key = (channel.name, channel.type)
-            counts[key] = counts.get(key, 0) + count
+            counts[channel.name, channel.type] += count
     return [Topic(name=name, type=type_, n_messages=n) for (name, type_), n in counts.items()]
 
 
