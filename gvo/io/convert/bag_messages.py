@@ -10,15 +10,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.interfaces import (
-    Connection,
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
+from rosbags import interfaces
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -37,15 +29,15 @@ _ROS2_VERSION: Final = 8
 _MAX_SECONDS_ROS1 = 2**32 - 1
 _MAX_SECONDS_ROS2 = 2**31 - 1
 # What tf2's static broadcaster offers: who comes late is given the last message all the same.
-_LATCHED_QOS: Final = Qos(
-    history=QosHistory.KEEP_LAST,
+_LATCHED_QOS: Final = interfaces.Qos(
+    history=interfaces.QosHistory.KEEP_LAST,
     depth=1,
-    reliability=QosReliability.RELIABLE,
-    durability=QosDurability.TRANSIENT_LOCAL,
-    deadline=QosTime(0, 0),
-    lifespan=QosTime(0, 0),
-    liveliness=QosLiveliness.SYSTEM_DEFAULT,
-    liveliness_lease_duration=QosTime(0, 0),
+    reliability=interfaces.QosReliability.RELIABLE,
+    durability=interfaces.QosDurability.TRANSIENT_LOCAL,
+    deadline=interfaces.QosTime(0, 0),
+    lifespan=interfaces.QosTime(0, 0),
+    liveliness=interfaces.QosLiveliness.SYSTEM_DEFAULT,
+    liveliness_lease_duration=interfaces.QosTime(0, 0),
     avoid_ros_namespace_conventions=False,
 )
 # The transport's header: how the depth is quantised, of which counts of 16 bits make no use.
@@ -175,7 +167,7 @@ class BagWriter(MessageWriter):
             self._writer = Writer2(folder, version=_ROS2_VERSION, storage_plugin=plugin)
             if path.suffix:
                 self.result = folder / path.name
-        self._connections: dict[str, Connection] = {}
+        self._connections: dict[str, interfaces.Connection] = {}
         self._log_time_ns = 0
         self._keeps_order = keeps_order
         self._newest_ns: dict[str, int] = {}  # log times by topic
@@ -202,7 +194,7 @@ class BagWriter(MessageWriter):
         data = self.serialize(message, type_)
         self._writer.write(self._connections[topic], self._log_time_ns, data)
 
-    def _connect(self, topic: str, type_: str, *, is_latched: bool) -> Connection:
+    def _connect(self, topic: str, type_: str, *, is_latched: bool) -> interfaces.Connection:
         if isinstance(self._writer, Writer1):
             return self._writer.add_connection(
                 topic, type_, typestore=self._store, latching=1 if is_latched else None

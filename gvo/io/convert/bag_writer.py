@@ -16,18 +16,8 @@ from rosbags.rosbag2 import WriterError as WriterError2
 
 from gvo.errors import RecordingError
 from gvo.geometry.camera import Calibration
-from gvo.io.convert import common
-from gvo.io.convert.bag_messages import (
-    BagWriter,
-    FramePose,
-    Header,
-    write_camera_info,
-    write_compressed,
-    write_compressed_depth,
-    write_image,
-    write_transforms,
-    write_truth,
-)
+from gvo.io.convert import bag_messages, common
+from gvo.io.convert.bag_messages import BagWriter, FramePose, Header
 from gvo.io.frames import ImagePreparer
 from gvo.io.images import MILLIMETRES, exact_counts
 from gvo.io.recording import RecordingInfo, Source, StampedImage
@@ -136,12 +126,12 @@ class _Writer:
         stamp_ns = min([stamp_ns, *(first_ns for first_ns, _ in list(self._poses)[:1])])
         first, second = self._streams
         poses = static_poses(self._source, (first.frame_id, second.frame_id), stamp_ns)
-        write_transforms(bag, "/tf_static", poses, is_latched=True)
+        bag_messages.write_transforms(bag, "/tf_static", poses, is_latched=True)
 
     def _write_poses(self, bag: BagWriter, until_ns: int | None = None) -> None:
         """Write, and take away, the poses up to a stamp; all of them without one."""
         while self._poses and (until_ns is None or self._poses[0][0] <= until_ns):
-            write_truth(bag, *self._poses.popleft())
+            bag_messages.write_truth(bag, *self._poses.popleft())
 
     def _write_image(self, bag: BagWriter, image: StampedImage) -> bool:
         """Write an image; False, with a note, where it cannot be read."""
@@ -150,7 +140,7 @@ class _Writer:
         if pixels is None:
             return False
         header = Header(image.stamp_ns, stream.frame_id)
-        write_camera_info(bag, stream.info_topic, stream.calibration, header)
+        bag_messages.write_camera_info(bag, stream.info_topic, stream.calibration, header)
         stream.write(bag, pixels, header)
         return True
 
@@ -187,11 +177,13 @@ class BagStream:
     def write(self, bag: BagWriter, pixels: NDArray[Any], header: Header) -> None:
         """Write an image, as PNG where that was asked for."""
         if not self.is_compressed:
-            write_image(bag, self.topic, pixels, header)
+            bag_messages.write_image(bag, self.topic, pixels, header)
         elif pixels.dtype == np.float32:
-            write_compressed_depth(bag, f"{self.topic}/compressedDepth", pixels, header)
+            bag_messages.write_compressed_depth(
+                bag, f"{self.topic}/compressedDepth", pixels, header
+            )
         else:
-            write_compressed(bag, f"{self.topic}/compressed", pixels, header)
+            bag_messages.write_compressed(bag, f"{self.topic}/compressed", pixels, header)
 
 
 def plan_streams(source: Source, *, rectify: bool, compress: bool) -> BagStreams:

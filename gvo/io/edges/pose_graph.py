@@ -14,18 +14,7 @@ import numpy as np
 from gvo._text import text_lines
 from gvo.errors import OutputError, TrajectoryError, write_faults
 from gvo.io.edges.events import EdgeEvent, Event, InputFaults, PoseEvent, anchor, inverted
-from gvo.trajectory.g2o import (
-    MEASUREMENT_TAGS,
-    TAGS,
-    Fix,
-    Line,
-    Measurement,
-    Vertex,
-    convert_line,
-    format_vertex,
-    parse_line,
-    parse_lines,
-)
+from gvo.trajectory import g2o
 from gvo.types import Edge, FloatArray, FrameId, PosePrior
 
 _SECOND_NS = 1_000_000_000
@@ -94,9 +83,9 @@ class PoseGraphSource:
         if self._start_id is not None:
             yield graph.start(self._start_id)
         for line in self._lines():
-            if isinstance(line, Measurement):
+            if isinstance(line, g2o.Measurement):
                 yield from graph.take(line)
-            elif isinstance(line, Vertex) and self.vertices is not None:
+            elif isinstance(line, g2o.Vertex) and self.vertices is not None:
                 self.vertices[line.frame_id] = line.T_world_frame
         yield from graph.flush()
         self._report_unconnected(graph)
@@ -115,44 +104,40 @@ class PoseGraphSource:
             if number == self._malformed:
                 return
             tag = text.split(maxsplit=1)[0]
-            if tag in MEASUREMENT_TAGS or tag == "FIX":
+            if tag in g2o.MEASUREMENT_TAGS or tag == "FIX":
                 try:
-                    line = convert_line(text)
+                    line = g2o.convert_line(text)
                 except ValueError:
                     return
                 yield line
 
     def _scan(self) -> None:
         """Find what holds the world, and the tags that are not understood, in one quick pass."""
-        first_vertex: Vertex | None = None
-        first_edge: Measurement | None = None
+        first_vertex: g2o.Vertex | None = None
+        first_edge: g2o.Measurement | None = None
         fixed_ids: list[int] = []
         for number, text in self._texts():
             tag = text.split(maxsplit=1)[0]
-            if tag not in TAGS:
+            if tag not in g2o.TAGS:
                 self._note_foreign(tag, number)
-            elif tag == "FIX":
+                continue
+            is_edge = tag in g2o.MEASUREMENT_TAGS
+            self._n_vertices += not is_edge and tag != "FIX"
+            if tag == "FIX" or (first_edge if is_edge else first_vertex) is None:
                 line = self._parsed(number, text)
-                fixed_ids += line.frame_ids if isinstance(line, Fix) else ()
-            elif tag in MEASUREMENT_TAGS:
-                if first_edge is None:
-                    line = self._parsed(number, text)
-                    first_edge = line if isinstance(line, Measurement) else None
-            else:
-                self._n_vertices += 1
-                if first_vertex is None:
-                    line = self._parsed(number, text)
-                    first_vertex = line if isinstance(line, Vertex) else None
+                fixed_ids += line.frame_ids if isinstance(line, g2o.Fix) else ()
+                first_edge = line if isinstance(line, g2o.Measurement) else first_edge
+                first_vertex = line if isinstance(line, g2o.Vertex) else first_vertex
         if first_edge is None:
             foreign = "".join(f" ({warning})" for warning in self.faults.warnings())
             raise TrajectoryError(
                 f"{self._path}: holds no edge between poses in 3-D; expected lines of "
-                f"{' or '.join(MEASUREMENT_TAGS)}{foreign}"
+                f"{' or '.join(g2o.MEASUREMENT_TAGS)}{foreign}"
             )
         self._choose_anchor(fixed_ids, first_vertex, first_edge)
 
     def _choose_anchor(
-        self, fixed_ids: list[int], first_vertex: Vertex | None, first_edge: Measurement
+        self, fixed_ids: list[int], first_vertex: g2o.Vertex | None, first_edge: g2o.Measurement
     ) -> None:
         if fixed_ids:
             self._start_id = fixed_ids[0]
@@ -164,30 +149,30 @@ class PoseGraphSource:
             self._start_id = first_edge.reference_id
 
     def _vertices(self, frame_ids: set[int]) -> dict[int, FloatArray]:
-        lines = (line for line in self._lines() if isinstance(line, Vertex))
+        lines = (line for line in self._lines() if isinstance(line, g2o.Vertex))
         return {line.frame_id: line.T_world_frame for line in lines if line.frame_id in frame_ids}
 
     def _note_foreign(self, tag: str, number: int) -> None:
         if not _TAG.match(tag):
             raise TrajectoryError(
                 f"{self._path}:{number}: {tag[:40]!r} is no tag of a g2o file; expected lines of "
-                f"{', '.join(TAGS)}"
+                f"{', '.join(g2o.TAGS)}"
             )
         if not tag.startswith("PARAMS"):
             self.faults.add("lines are of tags that are not read", f"{tag} in line {number}")
 
-    def _lines(self) -> Iterator[Line]:
+    def _lines(self) -> Iterator[g2o.Line]:
         numbered = self._texts()
         while block := list(islice(numbered, _BLOCK)):
             try:
-                lines: Iterable[Line | None] = parse_lines([text for _, text in block])
+                lines: Iterable[g2o.Line | None] = g2o.parse_lines([text for _, text in block])
             except ValueError:
                 lines = (self._parsed(number, text) for number, text in block)
             yield from (line for line in lines if line is not None)
 
-    def _parsed(self, number: int, text: str) -> Line | None:
+    def _parsed(self, number: int, text: str) -> g2o.Line | None:
         try:
-            return parse_line(text)
+            return g2o.parse_line(text)
         except ValueError as error:
             self._malformed = number
             raise TrajectoryError(f"{self._path}:{number}: {error}") from None
@@ -222,9 +207,9 @@ class _Connector:
         self._fixed = fixed
         self._known = _Ids()
         self._stamps_ns = count(0, _SECOND_NS)
-        self._pending: tuple[int, list[Measurement]] | None = None
+        self._pending: tuple[int, list[g2o.Measurement]] | None = None
         # By either end, measurements by their number.
-        self._waiting: dict[int, dict[int, Measurement]] = {}
+        self._waiting: dict[int, dict[int, g2o.Measurement]] = {}
         self._numbers = count()
 
     @property
@@ -248,7 +233,7 @@ class _Connector:
             prior=anchor(self._fixed.get(frame_id, np.eye(4))),
         )
 
-    def take(self, line: Measurement) -> Iterator[Event]:
+    def take(self, line: g2o.Measurement) -> Iterator[Event]:
         ends = (line.reference_id, line.frame_id)
         if self._pending is not None and self._joins_pending(ends):
             self._pending[1].append(line)
@@ -282,7 +267,7 @@ class _Connector:
         queue = deque([frame_id])
         while queue:
             near = queue.popleft()
-            by_end: dict[int, list[Measurement]] = {}
+            by_end: dict[int, list[g2o.Measurement]] = {}
             for number, line in self._waiting.pop(near, {}).items():
                 far = line.frame_id if line.reference_id == near else line.reference_id
                 self._waiting.get(far, {}).pop(number, None)
@@ -295,7 +280,7 @@ class _Connector:
                     yield self._pose(far, lines)
                     queue.append(far)
 
-    def _pose(self, frame_id: int, lines: list[Measurement]) -> PoseEvent:
+    def _pose(self, frame_id: int, lines: list[g2o.Measurement]) -> PoseEvent:
         self._known.add(frame_id)
         prior: PosePrior | None = None
         if frame_id in self._fixed:
@@ -311,7 +296,7 @@ class _Connector:
         )
 
 
-def _edge(line: Measurement) -> Edge:
+def _edge(line: g2o.Measurement) -> Edge:
     return Edge(
         reference_id=line.reference_id,
         T_reference_frame=line.T_reference_frame,
@@ -373,7 +358,7 @@ class GraphFile:
     def add(self, stamp_ns: int, frame_id: FrameId, T_world_frame: FloatArray) -> None:
         """Write a smoothed pose, named by a whole number; they may come in any order."""
         with self._refused_on_error():
-            self._file.write(f"{stamp_ns} {format_vertex(str(frame_id), T_world_frame)}\n")
+            self._file.write(f"{stamp_ns} {g2o.format_vertex(str(frame_id), T_world_frame)}\n")
 
     def close(self, measurement_lines: Iterable[str]) -> None:
         """Sort the vertices by their stamps, and add the measurements.

@@ -17,20 +17,7 @@ from gvo.io.recording import RecordingInfo, Sensor, StampedImage
 from gvo.io.synthetic.moving_scene import MovingScene
 from gvo.io.synthetic.rendering import scale_camera, to_uint8
 from gvo.io.synthetic.scene import Scene
-from gvo.io.synthetic.worlds.deceptive import (
-    blank_room,
-    facade,
-    mirror_room,
-    ride,
-    rooms,
-    traffic,
-    traffic_drive,
-    turn_away,
-    walk,
-)
-from gvo.io.synthetic.worlds.motion import drive, drive_block, hover, look_around, turn_fast
-from gvo.io.synthetic.worlds.room import room
-from gvo.io.synthetic.worlds.street import block, street
+from gvo.io.synthetic.worlds import deceptive, motion, room, street
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import BoolArray, DepthArray, FloatArray, ImageArray, IntArray
 
@@ -265,16 +252,16 @@ def _by_seed(move: Callable[[int, FloatArray], FloatArray]) -> Callable[[int], _
 
 
 _WORLDS = {
-    "driving": _by_car(street, _always(drive)),
-    "handheld": _by_hand(room, _always(look_around)),
-    "turning": _by_hand(room, _by_seed(turn_fast)),
-    "hovering": _by_hand(room, _by_seed(hover)),
-    "traffic": _by_car(traffic, _always(traffic_drive)),
-    "facade": _by_car(facade, _always(ride)),
-    "mirror": _by_hand(mirror_room, _always(look_around)),
-    "wall": _by_hand(blank_room, _always(turn_away)),
-    "block": _by_car(block, _by_seed(drive_block)),
-    "rooms": _by_hand(rooms, _by_seed(walk)),
+    "driving": _by_car(street.street, _always(motion.drive)),
+    "handheld": _by_hand(room.room, _always(motion.look_around)),
+    "turning": _by_hand(room.room, _by_seed(motion.turn_fast)),
+    "hovering": _by_hand(room.room, _by_seed(motion.hover)),
+    "traffic": _by_car(deceptive.traffic, _always(deceptive.traffic_drive)),
+    "facade": _by_car(deceptive.facade, _always(deceptive.ride)),
+    "mirror": _by_hand(deceptive.mirror_room, _always(motion.look_around)),
+    "wall": _by_hand(deceptive.blank_room, _always(deceptive.turn_away)),
+    "block": _by_car(street.block, _by_seed(motion.drive_block)),
+    "rooms": _by_hand(deceptive.rooms, _by_seed(deceptive.walk)),
 }
 
 
