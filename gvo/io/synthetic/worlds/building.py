@@ -102,3 +102,9 @@ def box(
     heights = (bottom, bottom + height)
     sides = [wall(corners[k], corners[(k + 1) % 4], heights, texture) for k in range(4)]
     return [*sides, slab(center - f, center + f, width, bottom + height, top or texture)]
+
+
+def fronted(body: list[Rectangle], texture: str, *, is_lit: bool = True) -> list[Rectangle]:
+    """Return a box with a texture stretched over the wall that comes first."""
+    front, *others = body
+    return [replace(front, texture=texture, is_stretched=True, is_lit=is_lit), *others]

@@ -14,8 +14,8 @@ from gvo.io.synthetic import textures as paint
 from gvo.io.synthetic.moving_scene import MovingScene
 from gvo.io.synthetic.scene import Rectangle, Scene, make_scene
 from gvo.io.synthetic.textures import Texture
-from gvo.io.synthetic.worlds.building import box, plain, slab, stretched, wall
-from gvo.io.synthetic.worlds.motion import CAMERA_HEIGHT_M, R_MAP_LEVEL, drive_along, look_around
+from gvo.io.synthetic.worlds import motion
+from gvo.io.synthetic.worlds.building import box, fronted, plain, slab, stretched, wall
 from gvo.io.synthetic.worlds.room import LAMP, room_rectangles, room_textures
 from gvo.io.synthetic.worlds.street import DAYLIGHT, street_rectangles
 from gvo.io.synthetic.worlds.street_textures import street_textures
@@ -78,7 +78,7 @@ def traffic_drive(stamps_s: FloatArray) -> FloatArray:
     rising_s = np.minimum(gone_s, _SPEED_M_S / _START_M_S2)
     s = s + 0.5 * _START_M_S2 * rising_s**2 + _SPEED_M_S * (gone_s - rising_s)
     speeds = _BRAKE_M_S2 * left_s + _START_M_S2 * rising_s
-    return drive_along(t, s, shake=np.minimum(speeds / _SPEED_M_S, 1.0))
+    return motion.drive_along(t, s, shake=np.minimum(speeds / _SPEED_M_S, 1.0))
 
 
 def bus_path(elapsed_s: float) -> FloatArray:
@@ -161,25 +161,19 @@ def ride(stamps_s: FloatArray) -> FloatArray:
     x = 0.5 * _ACCELERATION_M_S2 * rising_s**2 + _FACADE_SPEED_M_S * (t - rising_s)
     pace = rising_s * _ACCELERATION_M_S2 / _FACADE_SPEED_M_S
     sway = pace * np.stack([0.03 * np.sin(2.1 * t), 0.01 * np.sin(5.3 * t + 1)])
-    position = np.column_stack([x, sway[0], CAMERA_HEIGHT_M + sway[1]])
-    zeros = np.zeros_like(t)
+    position = np.column_stack([x, sway[0], motion.CAMERA_HEIGHT_M + sway[1]])
     tilts = [0.004 * np.sin(3.7 * t), 0.006 * np.sin(1.9 * t), 0.004 * np.sin(4.3 * t)]
-    tilt = exp(np.stack([*(pace * each for each in tilts), zeros, zeros, zeros], axis=-1))
-    level = make_transform(np.broadcast_to(R_MAP_LEVEL, (len(t), 3, 3)), position)
-    return np.asarray(level @ tilt)
+    return motion.level_and_turned(position, np.column_stack([pace * each for each in tilts]))
 
 
 @lru_cache(maxsize=2)
 def facade(seed: int) -> Scene:
     """Build the house front, the street before it, and what stands there."""
     first, last = _ENDS_M
-    front = wall(
-        np.array([first, _FRONT_M]), np.array([last, _FRONT_M]), (0.0, 16.0), plain("windows")
-    )
     ends = np.array([first, 0.0]), np.array([last, 0.0])
     aside = np.array([0.0, 1.0])
     rectangles = [
-        front,
+        wall(ends[0] + _FRONT_M * aside, ends[1] + _FRONT_M * aside, (0.0, 16.0), plain("windows")),
         slab(ends[0], ends[1], 12.0, 0.0, plain("asphalt")),
         slab(ends[0] + 7.0 * aside, ends[1] + 7.0 * aside, 2.0, 0.1, plain("pavement")),
         wall(ends[0] + 6.0 * aside, ends[1] + 6.0 * aside, (0.0, 0.1), plain("kerb")),
@@ -272,9 +266,8 @@ def turn_away(stamps_s: FloatArray) -> FloatArray:
     away = _smooth((stamps_s - start) / duration)
     back = _smooth((stamps_s - start - duration - _BLANK_S) / duration)
     zeros = np.zeros_like(stamps_s)
-    angles = -np.pi * (away - back)
-    yaw = exp(np.stack([zeros, zeros, angles, zeros, zeros, zeros], axis=-1))
-    T_map_cam = look_around(stamps_s)
+    yaw = motion.turned(np.column_stack([zeros, zeros, -np.pi * (away - back)]))
+    T_map_cam = motion.look_around(stamps_s)
     T_map_cam[:, :3, :3] = yaw[:, :3, :3] @ T_map_cam[:, :3, :3]
     return T_map_cam
 
@@ -349,10 +342,8 @@ def _aisle() -> Iterator[Rectangle]:
     yield wall(*south, (0.0, 2.5), plain("wallpaper"))
     yield wall(*south, (0.0, 0.09), plain("wood"))
     for x, name, width in ((0.3, "landscape", 0.9), (-1.6, "chart", 0.5), (1.9, "abstract", 0.5)):
-        first, *others = box(
-            np.array([x, far + 0.015]), np.pi, (0.03, width, 0.65), plain("wood"), bottom=1.2
-        )
-        yield from (replace(first, texture=name, is_stretched=True), *others)
+        center, size = np.array([x, far + 0.015]), (0.03, width, 0.65)
+        yield from fronted(box(center, np.pi, size, plain("wood"), bottom=1.2), name)
     yield from box(np.array([-1.7, far + 0.2]), 0.2, (0.3, 0.4, 0.35), stretched("carton"))
 
 
@@ -378,8 +369,7 @@ def walk(seed: int, stamps_s: FloatArray) -> FloatArray:
     rates, phases = rng.uniform(1.5, 5.0, 6), rng.uniform(0.0, 2.0 * np.pi, 6)
     sway = np.sin(rates * stamps_s[:, np.newaxis] + phases)
     position = np.column_stack([x, y, np.full_like(x, 1.4)]) + 0.012 * sway[:, :3]
-    tilt = exp(np.hstack([0.025 * sway[:, 3:] - [0.1, 0.0, 0.0], np.zeros((len(t), 3))]))
-    zeros = np.zeros_like(x)
-    yaw = exp(np.column_stack([zeros, zeros, np.radians(heading), zeros, zeros, zeros]))
-    level = make_transform(yaw[:, :3, :3] @ R_MAP_LEVEL, position)
+    tilt = motion.turned(0.025 * sway[:, 3:] - [0.1, 0.0, 0.0])
+    yaw = motion.turned(np.column_stack([np.zeros((len(x), 2)), np.radians(heading)]))
+    level = make_transform(yaw[:, :3, :3] @ motion.R_MAP_LEVEL, position)
     return np.asarray(level @ tilt)

@@ -169,7 +169,7 @@ def _by_car(
     position = np.column_stack([ground, CAMERA_HEIGHT_M + bounce])
     pitch = shake * (0.004 * np.sin(7.3 * t + 1) + 0.003 * np.sin(2.1 * t))
     roll = shake * (0.004 * np.sin(5.9 * t) + 0.004 * np.sin(1.3 * t + 0.5))
-    tilt = exp(np.stack([pitch, zeros, roll, zeros, zeros, zeros], axis=-1))
+    tilt = turned(np.column_stack([pitch, zeros, roll]))
     return np.asarray(make_transform(R, position) @ tilt)
 
 
@@ -189,7 +189,7 @@ def look_around(stamps_s: FloatArray) -> FloatArray:
     tilts = np.array([0.20, 0.48, 0.13, 0.03, 0.05, 0.03])  # rad about x, y, z of the camera
     rates = np.array([1.1, 0.9, 1.3, 3.1, 2.7, 2.3])
     turns = tilts * np.sin(rates * t + [0.4, 0.0, 1.2, 2.0, 0.9, 0.1])
-    return _level_and_turned(position, turns[:, :3] + turns[:, 3:] + [-0.12, 0.0, 0.0])
+    return level_and_turned(position, turns[:, :3] + turns[:, 3:] + [-0.12, 0.0, 0.0])
 
 
 def turn_fast(seed: int, stamps_s: FloatArray) -> FloatArray:
@@ -210,7 +210,7 @@ def turn_fast(seed: int, stamps_s: FloatArray) -> FloatArray:
     waves = np.sin(rates * t + rng.uniform(0.0, 2.0 * np.pi, 6))
     position = np.array([0.0, -0.75, 1.35]) + np.array([0.06, 0.05, 0.04]) * waves[:, :3]
     turns = np.array([0.25, 0.5, 0.36]) * waves[:, 3:] + [-0.12, 0.0, 0.0]
-    return _level_and_turned(position, turns)
+    return level_and_turned(position, turns)
 
 
 def hover(seed: int, stamps_s: FloatArray) -> FloatArray:
@@ -239,11 +239,15 @@ def hover(seed: int, stamps_s: FloatArray) -> FloatArray:
     jitter = 0.001 * waves  # m, rad
     position = np.array([0.0, -0.75, 1.35]) + flown[:, :3] + jitter[:, :3]
     turns = np.column_stack([flown[:, 3:] - [0.12, 0.0], np.zeros(len(flown))]) + jitter[:, 3:]
-    return _level_and_turned(position, turns)
+    return level_and_turned(position, turns)
 
 
-def _level_and_turned(position: FloatArray, turns: FloatArray) -> FloatArray:
+def level_and_turned(position: FloatArray, turns: FloatArray) -> FloatArray:
     """Return the poses of level cameras at positions (n, 3), then turned by vectors (n, 3)."""
-    rotation = exp(np.column_stack([turns, np.zeros_like(turns)]))
     level = make_transform(np.broadcast_to(R_MAP_LEVEL, (len(turns), 3, 3)), position)
-    return np.asarray(level @ rotation)
+    return np.asarray(level @ turned(turns))
+
+
+def turned(turns: FloatArray) -> FloatArray:
+    """Return the transforms (n, 4, 4) of rotation vectors (n, 3)."""
+    return exp(np.column_stack([turns, np.zeros_like(turns)]))

@@ -11,7 +11,7 @@ import numpy as np
 from gvo.io.synthetic import textures as paint
 from gvo.io.synthetic.scene import Light, Rectangle, Scene, make_scene
 from gvo.io.synthetic.textures import Canvas, Texture
-from gvo.io.synthetic.worlds.building import box, ground_axes, plain, slab, stretched, wall
+from gvo.io.synthetic.worlds.building import box, fronted, ground_axes, plain, slab, stretched, wall
 from gvo.types import FloatArray
 
 _WORDS = (
@@ -78,16 +78,12 @@ def _picture(
     center: FloatArray, angle: float, size: tuple[float, float], height: float, name: str
 ) -> Iterator[Rectangle]:
     """Yield a picture on a wall that is looked at in a direction."""
-    first, *others = box(center, angle, (0.02, *size), plain("wood"), bottom=height)
-    yield replace(first, texture=name, is_stretched=True)
-    yield from others
+    yield from fronted(box(center, angle, (0.02, *size), plain("wood"), bottom=height), name)
 
 
 def _north_side() -> Iterator[Rectangle]:
     """Yield the bookcase, the window with its curtains, and pictures on three walls."""
-    front, *others = box(_at(-1.15, 1.82), _NORTH, (0.34, 1.2, 1.95), plain("wood"))
-    yield replace(front, texture="books", is_stretched=True)
-    yield from others
+    yield from fronted(box(_at(-1.15, 1.82), _NORTH, (0.34, 1.2, 1.95), plain("wood")), "books")
     yield from _carton(_at(-1.4, 1.8), 0.1, 0.32, 1.95)
     window = replace(stretched("window"), is_lit=False, gain=1.05)
     yield wall(_at(0.0, 1.99), _at(1.3, 1.99), (1.05, 2.15), window)
@@ -107,23 +103,20 @@ def _table(
     """Yield a top on four legs; the size is along the heading, across it, upwards."""
     length, width, height = size
     yield from box(center, angle, (length, width, 0.035), plain("wood"), bottom=height - 0.035)
-    below = (center, angle, (length, width), height - 0.036)
     forward, right = ground_axes(angle)
     for a in (-1, 1):
         for b in (-1, 1):
             foot = center + a * (0.5 * length - leg) * forward + b * (0.5 * width - leg) * right
-            yield from box(foot, angle, (leg, leg, below[3]), plain("wood"))[:4]
+            yield from box(foot, angle, (leg, leg, height - 0.036), plain("wood"))[:4]
 
 
 def _desk(center: FloatArray) -> Iterator[Rectangle]:
     """Yield a desk with a monitor, a keyboard, paper, books and a mug."""
     top = 0.74
     yield from _table(center, _NORTH, (0.7, 1.5, top), 0.06)
-    screen, *others = box(
-        center + _at(-0.05, 0.15), 0.12, (0.03, 0.6, 0.36), plain("fabric"), bottom=top + 0.12
-    )
-    yield replace(screen, texture="screen", is_stretched=True, is_lit=False)
-    yield from others
+    at, size = center + _at(-0.05, 0.15), (0.03, 0.6, 0.36)
+    screen = box(at, 0.12, size, plain("fabric"), bottom=top + 0.12)
+    yield from fronted(screen, "screen", is_lit=False)
     yield from box(center + _at(-0.05, 0.19), 0.12, (0.04, 0.08, 0.13), plain("fabric"), bottom=top)
     keys = stretched("keyboard")
     size = (0.15, 0.45, 0.02)
@@ -133,17 +126,10 @@ def _desk(center: FloatArray) -> Iterator[Rectangle]:
         start = center + _at(x, y) - 0.15 * forward
         yield slab(start, start + 0.3 * forward, 0.21, top + 0.002, stretched("page"))
     for k in range(4):
-        size = (0.17, 0.24 - 0.02 * k, 0.035)
-        yield from box(
-            center + _at(0.55, 0.2),
-            0.2 * k - 0.3,
-            size,
-            stretched("cushion"),
-            bottom=top + 0.035 * k,
-        )
-    yield from box(
-        center + _at(0.32, -0.2), 0.4, (0.08, 0.08, 0.1), stretched("abstract"), bottom=top
-    )
+        at, size, bottom = center + _at(0.55, 0.2), (0.17, 0.24 - 0.02 * k, 0.035), top + 0.035 * k
+        yield from box(at, 0.2 * k - 0.3, size, stretched("cushion"), bottom=bottom)
+    mug = stretched("abstract")
+    yield from box(center + _at(0.32, -0.2), 0.4, (0.08, 0.08, 0.1), mug, bottom=top)
 
 
 def _sofa(center: FloatArray) -> Iterator[Rectangle]:
@@ -173,9 +159,8 @@ def _chair(center: FloatArray, angle: float) -> Iterator[Rectangle]:
 
 
 def _carton(center: FloatArray, angle: float, size: float, bottom: float) -> Iterator[Rectangle]:
-    yield from box(
-        center, angle, (size, 1.15 * size, 0.8 * size), stretched("carton"), bottom=bottom
-    )
+    sizes = (size, 1.15 * size, 0.8 * size)
+    yield from box(center, angle, sizes, stretched("carton"), bottom=bottom)
 
 
 def _cartons(center: FloatArray) -> Iterator[Rectangle]:
@@ -192,9 +177,8 @@ def _coffee_table(center: FloatArray, angle: float) -> Iterator[Rectangle]:
         forward, _ = ground_axes(angle + turn)
         start = center + _at(x, -0.12)
         yield slab(start, start + 0.28 * forward, 0.2, 0.403, stretched("page"))
-    yield from box(
-        center + _at(0.25, 0.05), 0.7, (0.16, 0.22, 0.12), stretched("chart"), bottom=0.4
-    )
+    size = (0.16, 0.22, 0.12)
+    yield from box(center + _at(0.25, 0.05), 0.7, size, stretched("chart"), bottom=0.4)
 
 
 def _plant(center: FloatArray) -> Iterator[Rectangle]:

@@ -39,9 +39,7 @@ _PARKING = (-6.2, 3.15)
 _HOUSES = (-10.2, 7.6)
 _KERB_M = 0.12
 _SKY_M = 420.0
-DAYLIGHT = Light(
-    direction=(0.5, -0.45, 0.8), ambient=0.82, direct=0.5, haze_m=800.0, haze_grey=205.0
-)
+DAYLIGHT = Light(direction=(0.5, -0.45, 0.8), ambient=0.82, direct=0.5, haze_m=800.0, haze_grey=205)
 # Rows of houses around the block, the first of which is built twice; where nobody may park.
 _ROWS = ((-10.0, 75.0), (75.0, 190.0), (275.0, 390.0))
 TWIN_M = 0.5 * LAP_M
