@@ -36,6 +36,7 @@ from gvo.types import Failure, FaultyFrame, Progress, RgbdFrame, StereoFrame
 if TYPE_CHECKING:
     from gvo.viz.view.live import LivePlayer
 
+_OnProgress: TypeAlias = Callable[[Progress], None]
 _Item: TypeAlias = Pair | FaultyFrame
 # Frames that are tied to one another before any is dropped, and what waits for them at most.
 _N_TIED = 2
@@ -143,7 +144,7 @@ class LiveOdometry:
         *,
         outputs: RunOutputs | None = None,
         force: bool = False,
-        on_progress: Callable[[Progress], None] = lambda _: None,
+        on_progress: _OnProgress = lambda _: None,
     ) -> list[LiveRun]:
         """Track until the images end, or `stop` is called; then write what a run writes.
 
@@ -184,12 +185,7 @@ class LiveOdometry:
         return self._is_stopped or self._stretches.is_ended
 
     def _run_stretch(
-        self,
-        folder: Path,
-        outputs: RunOutputs,
-        number: int,
-        force: bool,
-        on_progress: Callable[[Progress], None],
+        self, folder: Path, outputs: RunOutputs, number: int, force: bool, on_progress: _OnProgress
     ) -> LiveRun:
         if number > 1:
             folder = free_path(folder)

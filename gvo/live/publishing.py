@@ -20,15 +20,7 @@ from gvo.live.transport import NetworkWriter
 from gvo.runs.outputs.bag import RunMessages
 from gvo.runs.outputs.bag_messages import write_diagnostics
 from gvo.runs.outputs.frames import RunFrames
-from gvo.types import (
-    Estimate,
-    FaultyFrame,
-    FloatArray,
-    Frame,
-    FrameResult,
-    Optimum,
-    Status,
-)
+from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Optimum, Status
 
 _EVERY_S: Final = 1.0
 _SILENT_S: Final = 3.0
@@ -144,10 +136,7 @@ class Arrivals(AbstractContextManager["Arrivals"]):
     ) -> None:
         self._info, self._topics, self._writers, self._say = info, topics, writers, say
         self._n_dropped = n_dropped
-        self._times_s: tuple[deque[float], deque[float]] = (
-            deque(maxlen=_N_RECENT),
-            deque(maxlen=_N_RECENT),
-        )
+        self._times_s: list[deque[float]] = [deque(maxlen=_N_RECENT) for _ in (0, 1)]
         self._waiting_s: deque[tuple[int, float]] = deque(maxlen=_N_WAITING)
         self._newest_ns = 0
         self._text = ""

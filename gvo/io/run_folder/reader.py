@@ -18,12 +18,7 @@ from gvo._text import read_text, text_lines
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
 from gvo.io.run_folder.writer import GLOBAL, LOOPS, TRAJECTORIES, TRUE_POSITIONS, TRUTH
-from gvo.trajectory.formats import (
-    MAX_LINES,
-    MAX_POSITION_M,
-    read_covariances,
-    read_trajectory,
-)
+from gvo.trajectory.formats import MAX_LINES, MAX_POSITION_M, read_covariances, read_trajectory
 from gvo.trajectory.trajectory import StampsFrom, Trajectory
 from gvo.types import BoolArray, FloatArray, IntArray
 
