@@ -27,7 +27,7 @@ from gvo.config import list_parameters, values_by_name
 from gvo.errors import ConfigurationError, GvoError, missing_extra
 from gvo.io.bag.reader import typestore
 from gvo.io.bag.topics import COMPRESSED_TYPE, IMAGE_TYPE, Topic
-from gvo.live.transport import Parameters, Service, ServiceType, decode
+from gvo.live.transport import OnMessage, Parameters, Service, ServiceType, decode
 
 try:
     from cyclonedds import builtin, core, domain, pub, sub, topic, util
@@ -118,9 +118,7 @@ class Dds:
             self.subscribe(_CLOCK.name, _CLOCK.type, self._set_clock)
         return topics
 
-    def subscribe(
-        self, topic: str, type_: str, callback: Callable[[bytes, int], None]
-    ) -> Callable[[], None]:
+    def subscribe(self, topic: str, type_: str, callback: OnMessage) -> Callable[[], None]:
         """Receive the messages of a topic; see `Transport`."""
         is_image = type_ in (IMAGE_TYPE, COMPRESSED_TYPE)
         offers = [each.qos for each in self._writers() if each.topic_name == f"rt{topic}"]

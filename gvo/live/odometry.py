@@ -507,6 +507,5 @@ class WaitingPairs:
 
     def _dropped(self, pair: Pair, reason: str) -> FaultyFrame:
         self.n_dropped += 1
-        return FaultyFrame(
-            stamp_ns=pair[0].stamp_ns, reason=f"dropped, tracking is behind: {reason}"
-        )
+        reason = f"dropped, tracking is behind: {reason}"
+        return FaultyFrame(stamp_ns=pair[0].stamp_ns, reason=reason)

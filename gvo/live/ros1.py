@@ -33,7 +33,7 @@ from gvo.config import Config, Parameter, list_parameters
 from gvo.errors import ConfigurationError, GvoError, RecordingError
 from gvo.io.bag.reader import serialize, typestore
 from gvo.io.bag.topics import Topic
-from gvo.live.transport import Parameters, Service, ServiceType
+from gvo.live.transport import OnMessage, Parameters, Service, ServiceType
 
 _LOGGER = logging.getLogger(__name__)
 # Where Debian and Ubuntu have rospy. At the end of the path: before it, it shadows packages.
@@ -100,9 +100,7 @@ class Ros1:
             if name in others
         ]
 
-    def subscribe(
-        self, topic: str, type_: str, callback: Callable[[bytes, int], None]
-    ) -> Callable[[], None]:
+    def subscribe(self, topic: str, type_: str, callback: OnMessage) -> Callable[[], None]:
         """Receive the messages of a topic, see `Transport`."""
 
         def receive(message: Any) -> None:  # noqa: ANN401 - of a class made at run time

@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, TypeAlias
 
 from rosbags.typesys import get_types_from_msg
 
@@ -18,6 +18,9 @@ from gvo.errors import ConfigurationError
 from gvo.io.bag.reader import BagMessage, serialize, typestore
 from gvo.io.bag.topics import Topic
 from gvo.io.convert.bag_messages import MessageWriter
+
+OnMessage: TypeAlias = Callable[[bytes, int], None]
+"""Takes the bytes of a message, and when it came in nanoseconds."""
 
 
 class Publisher(Protocol):
@@ -79,9 +82,7 @@ class Transport(Sink, Protocol):
     def topics(self) -> Sequence[Topic]:
         """Return what others announce now, each with one message at least."""
 
-    def subscribe(
-        self, topic: str, type_: str, callback: Callable[[bytes, int], None]
-    ) -> Callable[[], None]:
+    def subscribe(self, topic: str, type_: str, callback: OnMessage) -> Callable[[], None]:
         """Receive the messages of a topic, those that are latched too.
 
         Parameters
