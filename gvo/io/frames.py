@@ -35,7 +35,8 @@ _Item: TypeAlias = Pair | FaultyFrame
 _Preparers: TypeAlias = tuple["ImagePreparer", "ImagePreparer"]
 Through: TypeAlias = Callable[[Iterator[_Item]], Iterator[_Item]]
 """What pairs go through before they are decoded."""
-_Jobs: TypeAlias = Sequence[Callable[[], NDArray[Any] | str]]
+_Prepared: TypeAlias = NDArray[Any] | str
+_Jobs: TypeAlias = Sequence[Callable[[], _Prepared]]
 _Started: TypeAlias = tuple[_Item, _Jobs]
 
 
@@ -195,27 +196,19 @@ def _decoded(
 def _finish(item: _Item, jobs: _Jobs, sensor: Sensor) -> Frame | FaultyFrame:
     if isinstance(item, FaultyFrame):
         return item
-    return _make_frame(item, [result() for result in jobs], sensor)
+    first, second = (result() for result in jobs)
+    if isinstance(first, str) or isinstance(second, str):
+        reasons = [each for each in (first, second) if isinstance(each, str)]
+        return FaultyFrame(stamp_ns=item[0].stamp_ns, reason="; ".join(reasons))
+    return _frame_of(sensor, (item[0].stamp_ns, item[1].stamp_ns), first, second)
 
 
-def _prepare(
-    image: StampedImage, preparer: ImagePreparer, info: RecordingInfo
-) -> NDArray[Any] | str:
+def _prepare(image: StampedImage, preparer: ImagePreparer, info: RecordingInfo) -> _Prepared:
     """Return the prepared image, or one line on what is wrong with it."""
     try:
         return preparer(image.load())
     except (RecordingError, *_LOAD_ERRORS) as error:
         return f"{info.stream_names[image.stream]} image: {_error_text(error)}"
-
-
-def _make_frame(
-    pair: Pair, results: list[NDArray[Any] | str], sensor: Sensor
-) -> Frame | FaultyFrame:
-    first, second = results
-    if isinstance(first, str) or isinstance(second, str):
-        reasons = [result for result in results if isinstance(result, str)]
-        return FaultyFrame(stamp_ns=pair[0].stamp_ns, reason="; ".join(reasons))
-    return _frame_of(sensor, (pair[0].stamp_ns, pair[1].stamp_ns), first, second)
 
 
 def _frame_of(

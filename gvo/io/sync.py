@@ -147,9 +147,7 @@ class _Answers:
             reason += "; the driver stamps nothing: --set sync.stamps=recording takes the bag's"
         self._ready.append(FaultyFrame(stamp_ns=image.stamp_ns, reason=reason))
 
-    def add_alone(
-        self, image: StampedImage, next_ns: int | None, *, is_crowded: bool = False
-    ) -> None:
+    def add_alone(self, image: StampedImage, next_ns: int | None, *, is_crowded: bool) -> None:
         """Answer for an image without partner; `next_ns`: the next stamp of stream 1."""
         if self.is_late(image):
             self.add_late(image)
@@ -229,17 +227,11 @@ class _ApproximateTime:
     """
 
     def __init__(
-        self,
-        limit_ns: int,
-        queue_size: int,
-        age_penalty: float,
-        answers: _Answers,
-        *,
-        is_prompt: bool,
+        self, limit_ns: int, queue_size: int, penalty: float, answers: _Answers, *, is_prompt: bool
     ) -> None:
         self._periods = (_Period(), _Period()) if is_prompt else None
         self._limit_ns, self._queue_size = limit_ns, queue_size
-        self._factor = 1 + age_penalty
+        self._factor = 1 + penalty
         self._answers = answers
         self._queues: tuple[deque[StampedImage], deque[StampedImage]] = (deque(), deque())
         # Where images were given up, one of them might have suited a pivot better than what is
