@@ -388,9 +388,7 @@ def spoil_depth(depth: DepthArray, noise: SensorNoise, rng: np.random.Generator)
 def _blobs(shape: tuple[int, ...], share: float, rng: np.random.Generator) -> BoolArray:
     height, width = shape
     coarse = rng.standard_normal((height // _BLOB_PX + 2, width // _BLOB_PX + 2))
-    field: FloatArray = np.asarray(
-        cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
-    )
+    field = np.asarray(cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC))
     return np.asarray(field > np.quantile(field, 1.0 - share))
 
 

@@ -21,6 +21,8 @@ from gvo.types import BoolArray, DepthArray, FloatArray, ImageArray, IntArray
 SampleArray: TypeAlias = NDArray[np.float32]
 IndexArray: TypeAlias = NDArray[np.int16]
 Plane: TypeAlias = tuple[FloatArray, FloatArray]
+_Box: TypeAlias = tuple[slice, slice]
+_Pixels: TypeAlias = tuple[IntArray, IntArray]
 
 NOTHING = -1
 _NEAR_M = 0.05
@@ -333,9 +335,7 @@ def find_visible(view: View) -> IndexArray:
     return visible
 
 
-def _draw(
-    view: View, k: int, box: tuple[slice, slice], nearest: SampleArray, visible: IndexArray
-) -> None:
+def _draw(view: View, k: int, box: _Box, nearest: SampleArray, visible: IndexArray) -> None:
     """Enter rectangle k into the buffers where it is the nearest one."""
     v, u = (np.arange(part.start, part.stop) for part in box)
     inverse_depths = _evaluate(view, view.inverse_depth, k, (u, v))
@@ -350,9 +350,7 @@ def _draw(
     np.copyto(visible[box], np.int16(k), where=mask)
 
 
-def _evaluate(
-    view: View, forms: FloatArray, k: int, pixels: tuple[IntArray, IntArray]
-) -> SampleArray:
+def _evaluate(view: View, forms: FloatArray, k: int, pixels: _Pixels) -> SampleArray:
     """Return a form of rectangle k at all columns and rows, shape (n_rows, n_columns)."""
     u, v = pixels
     slopes, offsets = view.along_rows(forms, k, v)
@@ -360,9 +358,7 @@ def _evaluate(
     return np.asarray(offsets.astype(np.float32)[:, np.newaxis] + along)
 
 
-def _shrink(
-    view: View, k: int, box: tuple[slice, slice], nearest: SampleArray
-) -> tuple[slice, slice]:
+def _shrink(view: View, k: int, box: _Box, nearest: SampleArray) -> _Box:
     """Leave rows out, above and below, where all is nearer than the rectangle can be."""
     rows, columns = box
     if (rows.stop - rows.start) * (columns.stop - columns.start) < _SMALL_BOX:
@@ -425,11 +421,7 @@ def _row_spans(view: View, k: int, rows: IntArray) -> tuple[IndexArray, IndexArr
 
 
 def _cut_out(
-    view: View,
-    k: int,
-    pixels: tuple[IntArray, IntArray],
-    inverse_depths: SampleArray,
-    mask: BoolArray,
+    view: View, k: int, pixels: _Pixels, inverse_depths: SampleArray, mask: BoolArray
 ) -> None:
     """Clear the mask over columns and rows where the texture of rectangle k is transparent."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # beyond the rectangle

@@ -35,10 +35,8 @@ def wall(
         What all but corner and edges are taken from.
     """
     bottom, top = heights
-    along = np.append(right - left, 0.0)
-    return replace(
-        texture, corner=np.append(left, top), edge_s=along, edge_t=(0.0, 0.0, bottom - top)
-    )
+    along, down = np.append(right - left, 0.0), (0.0, 0.0, bottom - top)
+    return replace(texture, corner=np.append(left, top), edge_s=along, edge_t=down)
 
 
 def slab(

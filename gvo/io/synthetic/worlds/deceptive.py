@@ -101,10 +101,7 @@ def traffic(seed: int) -> MovingScene:
 
 def _leaves_way(rectangle: Rectangle) -> bool:
     """Tell whether the bus does not run into a rectangle, or it is ground or sky."""
-    corner, s, t = (
-        np.asarray(v, dtype=np.float64)
-        for v in (rectangle.corner, rectangle.edge_s, rectangle.edge_t)
-    )
+    corner, s, t = np.array([rectangle.corner, rectangle.edge_s, rectangle.edge_t], dtype=float)
     corners = np.array([corner, corner + s, corner + t, corner + s + t])
     low, high = corners.min(axis=0), corners.max(axis=0)
     is_beside = high[1] < _CROSSING_M - 2.5 or low[1] > _CROSSING_M + 2.5
