@@ -66,7 +66,7 @@ def batch(
 
     if scheduler is not None and workers is not None:
         raise ConfigurationError("--workers starts processes here, --scheduler names a cluster")
-    asked, files = _sort_arguments(recordings, configs)
+    asked, files = _sort_arguments(recordings, configs or [])
     variants = make_variants(files, opt.with_loops(set_, loops), sweep or [])
     found = find_recordings(asked)
     files_from_anywhere = tuple(path.absolute() for path in paths_of(options.calibration))
@@ -89,11 +89,9 @@ def batch(
     _report(*outcome(table), out)
 
 
-def _sort_arguments(
-    recordings: list[str], configs: list[str] | None
-) -> tuple[list[str], list[Path]]:
+def _sort_arguments(recordings: list[str], configs: list[str]) -> tuple[list[str], list[Path]]:
     """Return recordings and configurations: the shell expands `--configs *.yaml` to arguments."""
-    given = [*(configs or []), *(one for one in recordings if one.endswith(_CONFIGURATIONS))]
+    given = [*configs, *(one for one in recordings if one.endswith(_CONFIGURATIONS))]
     rest = [one for one in recordings if not one.endswith(_CONFIGURATIONS)]
     if not rest:
         raise ConfigurationError("expected a recording beside the configurations")

@@ -54,10 +54,8 @@ def explain(
     out = opt.new_folder(out, recordings[0], what=f"-frame-{frame}", force=force)
     source = opt.open_source(recordings, parameters, options)
     with progress(source.info.name) as show:
-        explanation = explain_frame(
-            source, frame, config=parameters, excerpt=excerpt, on_progress=show
-        )
-        written = write_explanation(explanation, out)
+        found = explain_frame(source, frame, config=parameters, excerpt=excerpt, on_progress=show)
+        written = write_explanation(found, out)
     for path in written:
         say(path)
 

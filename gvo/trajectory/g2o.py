@@ -267,12 +267,8 @@ def g2o_lines(poses: Mapping[FrameId, FloatArray], graph: Sequence[GraphEdge]) -
         T_world_frame.
     graph : sequence of GraphEdge
     """
-    is_numbered = all(
-        isinstance(frame_id, int | np.integer) and frame_id >= 0 for frame_id in poses
-    )
-    numbers = {
-        frame_id: frame_id if is_numbered else number for number, frame_id in enumerate(poses)
-    }
+    is_numbered = all(isinstance(each, int | np.integer) and each >= 0 for each in poses)
+    numbers = {each: each if is_numbered else number for number, each in enumerate(poses)}
     for frame_id, T in poses.items():
         comment = "" if is_numbered else f"  # {frame_id!r}"
         yield f"{format_vertex(str(numbers[frame_id]), T)}{comment}"

@@ -109,7 +109,7 @@ def read_bag_cameras(
         if is_needed and name not in messages:
             raise CalibrationError(f"{where}: {name} yields no message; give --calibration FILE")
         if name is not None and name in messages:
-            cameras.append(_bag_camera(reader, (image, name), messages[name], where))
+            cameras.append(_bag_camera(reader, image, (name, messages[name]), where))
     return cameras[0], cameras[1] if len(cameras) > 1 else None
 
 
@@ -243,12 +243,9 @@ def _is_calibrated(message: Any) -> bool:  # noqa: ANN401 - of any type
 
 
 def _bag_camera(
-    reader: MessageReader,
-    source: tuple[Topic, str],
-    message: Any,  # noqa: ANN401 - ROS 1 or 2
-    where: str,
+    reader: MessageReader, image: Topic, named: tuple[str, Any], where: str
 ) -> BagCamera:
-    image, name = source
+    name, message = named
     fields = camera_fields(message, f"{where}: {name}")
     notes: tuple[str, ...] = ()
     if 0 in fields.recorded_size():

@@ -142,9 +142,8 @@ def stored_pixels(image: RawImage, encoding: Encoding, where: str) -> NDArray[An
         )
     shape = (rows, width, encoding.n_channels)
     data = np.ascontiguousarray(image.data).data
-    pixels: NDArray[Any] = np.ndarray(
-        shape, dtype, data, strides=(step, pixel_bytes, dtype.itemsize)
-    )
+    strides = (step, pixel_bytes, dtype.itemsize)
+    pixels: NDArray[Any] = np.ndarray(shape, dtype, data, strides=strides)
     if encoding.n_channels == 1:
         pixels = pixels[:, :, 0]
     return np.ascontiguousarray(pixels, dtype=dtype.newbyteorder("="))

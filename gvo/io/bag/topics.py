@@ -223,9 +223,7 @@ def _find(name: str, images: Sequence[Topic], where: str) -> Topic:
     return topic
 
 
-def _fitting(
-    pairs: Iterable[CameraTopics], chosen: Sequence[Topic | None]
-) -> Iterator[CameraTopics]:
+def _fitting(pairs: Iterable[CameraTopics], chosen: list[Topic | None]) -> Iterator[CameraTopics]:
     for pair in pairs:
         if chosen[0] in (None, pair.first) and chosen[1] in (None, pair.second):
             yield pair

@@ -387,10 +387,8 @@ def pair_of_extrinsics(
     """
     left, right = raw
     if _is_rectified_pair(left, right, T_left_right):
-        pair = (
-            _without_lens(left, left.K, 0.0),
-            _without_lens(right, left.K, float(T_left_right[0, 3])),
-        )
+        baseline = float(T_left_right[0, 3])
+        pair = _without_lens(left, left.K, 0.0), _without_lens(right, left.K, baseline)
     else:
         try:
             pair = rectify_stereo(left, right, T_left_right)
@@ -437,9 +435,7 @@ def pair_of_baseline(
 
 def _is_rectified_pair(left: Calibration, right: Calibration, T_left_right: FloatArray) -> bool:
     x, y, z = T_left_right[:3, 3]
-    is_pinhole = all(
-        camera.model != "equidistant" and not np.any(camera.D) for camera in (left, right)
-    )
+    is_pinhole = all(each.model != "equidistant" and not np.any(each.D) for each in (left, right))
     return bool(
         is_pinhole
         and (left.width, left.height) == (right.width, right.height)

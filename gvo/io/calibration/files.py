@@ -107,7 +107,8 @@ def read_cameras(paths: CalibrationPaths, *, sensor: Sensor, is_rectified: bool)
     origin = " + ".join(dict.fromkeys(str(file) for file in files))
     if sensor == "stereo":
         return _stereo_set(cameras, origin, is_rectified=is_rectified)
-    return _rgbd_set(cameras, contents, origin, is_rectified=is_rectified)
+    depth_scale = contents[0].depth_scale if contents else None
+    return _rgbd_set(cameras, origin, depth_scale, is_rectified=is_rectified)
 
 
 def paths_of(calibration: CalibrationPaths) -> tuple[Path, ...]:
@@ -140,9 +141,7 @@ def _files_of(path: Path) -> tuple[Path, ...]:
     )
 
 
-def _stereo_set(
-    cameras: Sequence[DescribedCamera], origin: str, *, is_rectified: bool
-) -> CameraSet:
+def _stereo_set(cameras: list[DescribedCamera], origin: str, *, is_rectified: bool) -> CameraSet:
     if len(cameras) < 2:
         raise CalibrationError(
             f"{origin}: holds one camera, expected two of a stereo pair: the keys left and right, "
@@ -175,11 +174,7 @@ def _extrinsics(left: DescribedCamera, right: DescribedCamera) -> tuple[FloatArr
 
 
 def _rgbd_set(
-    cameras: Sequence[DescribedCamera],
-    contents: Sequence[CalibrationFile],
-    origin: str,
-    *,
-    is_rectified: bool,
+    cameras: list[DescribedCamera], origin: str, depth_scale: float | None, *, is_rectified: bool
 ) -> CameraSet:
     if len(cameras) != 1:
         raise CalibrationError(
@@ -191,7 +186,7 @@ def _rgbd_set(
         calibrations=(calibration,),
         origin=origin,
         T_body_cam=_on_body(cameras[0], calibration),
-        depth_scale=contents[0].depth_scale,
+        depth_scale=depth_scale,
     )
 
 

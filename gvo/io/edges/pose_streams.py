@@ -273,9 +273,8 @@ def _interpolate(before: PoseSample, after: PoseSample, stamp_ns: int) -> PoseSa
     covariance = None
     if before.covariance is not None and after.covariance is not None:
         covariance = (1.0 - share) * before.covariance + share * after.covariance
-    return PoseSample(
-        stamp_ns=stamp_ns, T_world_frame=T @ se3.exp(share * turn), covariance=covariance
-    )
+    T = T @ se3.exp(share * turn)
+    return PoseSample(stamp_ns=stamp_ns, T_world_frame=T, covariance=covariance)
 
 
 def _step(before: PoseSample, after: PoseSample, sigma: StepSigma) -> Edge:

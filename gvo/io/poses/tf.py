@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -435,9 +435,7 @@ class TfBuffer:
         paths = list(self._paths(target, source, stamps_ns))
         return [path for path, _ in sorted(paths, key=lambda found: found[1].max(initial=-1))]
 
-    def _climb(
-        self, children: tuple[str, ...], stamps_ns: IntArray
-    ) -> tuple[FloatArray, BoolArray]:
+    def _climb(self, children: Sequence[str], stamps_ns: IntArray) -> tuple[FloatArray, BoolArray]:
         """Return T_ancestor_frame, shape (n, 4, 4), and where it is known.
 
         The children are those of the edges from the frame upwards.

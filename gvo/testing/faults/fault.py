@@ -296,11 +296,8 @@ class WrongFocalLength(CalibrationFault):
     def miscalibrate(self, calibration: Calibration) -> Calibration:
         """Return the calibration with fx, fy and fx * baseline multiplied."""
         scaling = np.diag([self.factor, self.factor, 1.0])
-        return replace(
-            calibration,
-            K=_with_focal(calibration.K, scaling),
-            P=_with_focal(calibration.P, scaling),
-        )
+        K, P = (_with_focal(matrix, scaling) for matrix in (calibration.K, calibration.P))
+        return replace(calibration, K=K, P=P)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
