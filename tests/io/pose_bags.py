@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from scipy.spatial.transform import Rotation
 
 from gvo.io.bag.reader import TF_TYPE, typestore
+from gvo.io.poses.tf import TfBuffer
 from gvo.types import FloatArray
 
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -20,6 +22,30 @@ STAMPED = "geometry_msgs/msg/PoseStamped"
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
 POINT = "geometry_msgs/msg/PointStamped"
 FIX = "sensor_msgs/msg/NavSatFix"
+
+
+def add_transform(
+    buffer: TfBuffer,
+    parent: str,
+    child: str,
+    stamp_ns: int,
+    T: FloatArray,
+    *,
+    is_static: bool = False,
+) -> None:
+    """Give a buffer a transform, shape (4, 4), as a message of tf does."""
+    sec, nanosec = divmod(stamp_ns, 10**9)
+    stamp = SimpleNamespace(sec=sec, nanosec=nanosec)
+    rotation = dict(zip("xyzw", Rotation.from_matrix(T[:3, :3]).as_quat().tolist(), strict=True))
+    message = SimpleNamespace(
+        header=SimpleNamespace(stamp=stamp, frame_id=parent),
+        child_frame_id=child,
+        transform=SimpleNamespace(
+            translation=SimpleNamespace(**dict(zip("xyz", T[:3, 3].tolist(), strict=True))),
+            rotation=SimpleNamespace(**rotation),
+        ),
+    )
+    buffer.add_message(message, is_static=is_static)
 
 
 class PoseBag:

@@ -90,11 +90,8 @@ class SampleLog:
     """Collects the transforms of one child frame in any order."""
 
     def __init__(self) -> None:
-        self._sorted = Samples(
-            stamps_ns=np.empty(0, dtype=np.int64),
-            poses=np.empty((0, _N_NUMBERS)),
-            parents=np.empty(0, dtype=np.int32),
-            changes_parent=False,
+        self._sorted = _sorted(
+            np.empty(0, dtype=np.int64), np.empty((0, _N_NUMBERS)), np.empty(0, dtype=np.int32)
         )
         self._clear_tail()
 
@@ -152,7 +149,6 @@ def _between(start: FloatArray, end: FloatArray, shares: FloatArray) -> FloatArr
 
 
 _SQUARED_NORM_TOLERANCE = 1e-2  # of quaternions, as in tf2
-_ROTATION_TOLERANCE = 1e-3
 
 
 class TfBuffer:
@@ -218,46 +214,8 @@ class TfBuffer:
             notes.append(f"tf: the parent of {list_names(changing)} changes over time")
         return notes
 
-    def add(
-        self,
-        parent: str,
-        child: str,
-        stamp_ns: int,
-        T_parent_child: FloatArray,
-        *,
-        is_static: bool = False,
-    ) -> None:
-        """Add a transform, in any order of stamps.
-
-        Parameters
-        ----------
-        parent, child : str
-            Names of the frames.
-        stamp_ns : int
-            Nanoseconds.
-        T_parent_child : ndarray of float64, shape (4, 4)
-            Maps coordinates of the child to the parent, metres.
-        is_static : bool
-            Whether it is valid at all stamps; of several of one child the last one counts.
-
-        Raises
-        ------
-        ValueError
-            When it is no rigid transform, a name is empty, or both names are the same.
-        """
-        T = np.array(T_parent_child, dtype=np.float64)
-        fault = se3.transform_fault(T, tolerance=_ROTATION_TOLERANCE)
-        if fault:
-            raise ValueError(f"T_parent_child of {parent} and {child} {fault}")
-        quaternion_xyzw = Rotation.from_matrix(se3.nearest_rotation(T[:3, :3])).as_quat()
-        pose = (*T[:3, 3].tolist(), *quaternion_xyzw.tolist())
-        reason = _fault(bare(parent), bare(child), pose)
-        if reason:
-            raise ValueError(f"{parent} -> {child}: {reason}")
-        self._put(bare(parent), bare(child), stamp_ns, pose, is_static=is_static)
-
     def add_message(self, message: Any, *, is_static: bool = False) -> None:  # noqa: ANN401
-        """Add a `geometry_msgs/TransformStamped`; an invalid one is only counted.
+        """Add a `geometry_msgs/TransformStamped`, in any order of stamps; count an invalid one.
 
         Parameters
         ----------
@@ -273,8 +231,17 @@ class TfBuffer:
         reason = _fault(parent, child, pose)
         if reason:
             self.refuse(f"{parent} -> {child} at {format_stamp(stamp_ns)} s: {reason}")
+            return
+        self._edges.add((parent, child))
+        number, _ = self._number(parent), self._number(child)
+        if self._kept is not None and child not in self._kept:
+            return
+        if is_static:
+            R = np.asarray(Rotation.from_quat(pose[3:]).as_matrix())
+            self._static[child] = (parent, se3.make_transform(R, np.array(pose[:3])))
         else:
-            self._put(parent, child, stamp_ns, pose, is_static=is_static)
+            self._moving.setdefault(child, SampleLog()).append(stamp_ns, pose, number)
+            self._n_moving += 1
 
     def refuse(self, reason: str) -> None:
         """Count an invalid transform, for a reason of one line."""
@@ -376,20 +343,6 @@ class TfBuffer:
         if number == len(self._names):
             self._names.append(name)
         return number
-
-    def _put(
-        self, parent: str, child: str, stamp_ns: int, pose: tuple[float, ...], *, is_static: bool
-    ) -> None:
-        self._edges.add((parent, child))
-        number, _ = self._number(parent), self._number(child)
-        if self._kept is not None and child not in self._kept:
-            return
-        if is_static:
-            R = np.asarray(Rotation.from_quat(pose[3:]).as_matrix())
-            self._static[child] = (parent, se3.make_transform(R, np.array(pose[:3])))
-        else:
-            self._moving.setdefault(child, SampleLog()).append(stamp_ns, pose, number)
-            self._n_moving += 1
 
     def _stamps_ns(self, children: Collection[str]) -> IntArray:
         """Return the stamps of all transforms of those children that move."""

@@ -12,6 +12,7 @@ from gvo.diagnostics.check.findings import Finding
 from gvo.diagnostics.check.frame_tree import check_frame_tree
 from gvo.io.poses.tf import TfBuffer
 from tests.diagnostics.check.planted import check, complaints, render
+from tests.io.pose_bags import add_transform
 
 S = 1_000_000_000
 STAMPS_NS = np.arange(0, 10 * S, S // 10, dtype=np.int64)
@@ -20,14 +21,14 @@ STAMPS_NS = np.arange(0, 10 * S, S // 10, dtype=np.int64)
 def tree(*, leave_out: str = "", moving_ns: Any = STAMPS_NS) -> TfBuffer:
     buffer = TfBuffer()
     for stamp_ns in moving_ns:
-        buffer.add("odom", "base_link", int(stamp_ns), np.eye(4))
+        add_transform(buffer, "odom", "base_link", int(stamp_ns), np.eye(4))
     for parent, child in (
         ("base_link", "camera_link"),
         ("camera_link", "camera_optical"),
         ("camera_optical", "eye"),
     ):
         if child != leave_out:
-            buffer.add(parent, child, 0, np.eye(4), is_static=True)
+            add_transform(buffer, parent, child, 0, np.eye(4), is_static=True)
     return buffer
 
 
@@ -70,7 +71,7 @@ def test_a_recording_without_transforms_or_names_is_no_fault() -> None:
 
 def test_a_single_transform_is_no_robot_that_misses_its_camera() -> None:
     buffer = TfBuffer()
-    buffer.add("world", "ground_truth", 0, np.eye(4))
+    add_transform(buffer, "world", "ground_truth", 0, np.eye(4))
     findings = look(buffer)
     assert complaints(findings) == set()
     assert findings["tf: frames"].value == "ground_truth, world"
@@ -78,11 +79,11 @@ def test_a_single_transform_is_no_robot_that_misses_its_camera() -> None:
 
 def test_the_ground_truth_of_a_data_set_is_no_second_tree() -> None:
     buffer = tree()
-    buffer.add("world", "ground_truth", 0, np.eye(4))
+    add_transform(buffer, "world", "ground_truth", 0, np.eye(4))
     assert complaints(look(buffer)) == set()
     cameras = TfBuffer()
-    cameras.add("world", "ground_truth", 0, np.eye(4))
-    cameras.add("left", "right", 0, np.eye(4), is_static=True)
+    add_transform(cameras, "world", "ground_truth", 0, np.eye(4))
+    add_transform(cameras, "left", "right", 0, np.eye(4), is_static=True)
     assert complaints(look(cameras, "left")) == set()
 
 

@@ -269,7 +269,7 @@ def test_a_mosaic_in_a_png_gets_its_colours(pattern: str) -> None:
 
 
 def test_damaged_and_foreign_compressed_images_are_refused_with_their_format(tiny: Any) -> None:
-    message = _compressed(tiny.texture(1), "mono8; png compressed ")
+    message: Any = _compressed(tiny.texture(1), "mono8; png compressed ")
     message.data = message.data[:50]
     with pytest.raises(RecordingError, match="/image"):
         decode_compressed(message, "/image")

@@ -15,6 +15,7 @@ from gvo.io.poses.base_frame import BaseFrame, parse_initial_pose
 from gvo.io.poses.tf import TfBuffer
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Edge, Estimate, FloatArray
+from tests.io.pose_bags import add_transform
 from tests.results import estimate_at
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
@@ -51,11 +52,11 @@ def mounted(rng: np.random.Generator, stamps_ns: Sequence[int]) -> tuple[TfBuffe
     """Return base -> pan (moving) -> mast -> cam (static), and T_base_cam (n, 4, 4) by hand."""
     buffer = TfBuffer()
     T_pan_mast, T_mast_cam = random_transform(rng), random_transform(rng)
-    buffer.add("pan", "mast", 0, T_pan_mast, is_static=True)
-    buffer.add("mast", "cam", 0, T_mast_cam, is_static=True)
+    add_transform(buffer, "pan", "mast", 0, T_pan_mast, is_static=True)
+    add_transform(buffer, "mast", "cam", 0, T_mast_cam, is_static=True)
     T_base_pan = [random_transform(rng) for _ in stamps_ns]
     for stamp_ns, T in zip(stamps_ns, T_base_pan, strict=True):
-        buffer.add("base", "pan", stamp_ns, T)
+        add_transform(buffer, "base", "pan", stamp_ns, T)
     return buffer, np.array([T @ T_pan_mast @ T_mast_cam for T in T_base_pan])
 
 
@@ -180,8 +181,8 @@ def test_while_the_camera_is_off_its_mount_the_transform_nearest_in_time_is_take
     buffer = TfBuffer()
     for stamp_ns in (10, 20, 60, 70):
         at = np.array([float(stamp_ns), 0.0, 0.0])
-        buffer.add("base", "cam", stamp_ns, se3.make_transform(np.eye(3), at))
-    buffer.add("shelf", "cam", 30, np.eye(4))
+        add_transform(buffer, "base", "cam", stamp_ns, se3.make_transform(np.eye(3), at))
+    add_transform(buffer, "shelf", "cam", 30, np.eye(4))
     frame = BaseFrame.from_tf(buffer, "base", "cam")
     xs = [float(frame.T_base_cam(stamp_ns)[0, 3]) for stamp_ns in (15, 25, 32, 50, 65)]
     np.testing.assert_allclose(xs, [15.0, 20.0, 20.0, 60.0, 65.0])
@@ -214,11 +215,11 @@ def test_frames_that_tf_does_not_connect_are_refused_in_one_line(
     frame: str, camera: str, words: Sequence[str]
 ) -> None:
     buffer = TfBuffer()
-    buffer.add("base_link", "mast", 0, np.eye(4), is_static=True)
-    buffer.add("mast", "cam", 0, np.eye(4), is_static=True)
-    buffer.add("car", "lidar", 0, np.eye(4), is_static=True)
-    buffer.add("base_link", "rider", 1, np.eye(4))
-    buffer.add("rider", "late", 2, np.eye(4))
+    add_transform(buffer, "base_link", "mast", 0, np.eye(4), is_static=True)
+    add_transform(buffer, "mast", "cam", 0, np.eye(4), is_static=True)
+    add_transform(buffer, "car", "lidar", 0, np.eye(4), is_static=True)
+    add_transform(buffer, "base_link", "rider", 1, np.eye(4))
+    add_transform(buffer, "rider", "late", 2, np.eye(4))
     with pytest.raises(RecordingError) as caught:
         BaseFrame.from_tf(buffer, frame, camera, where="drive.bag")
     text = str(caught.value)

@@ -15,7 +15,7 @@ from gvo.io.poses.truth import Truth, find_truth, in_frame
 from gvo.trajectory.evaluation import evaluate
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FloatArray
-from tests.io.pose_bags import ODOMETRY, PoseBag
+from tests.io.pose_bags import ODOMETRY, PoseBag, add_transform
 
 SECOND = 10**9
 T_BASE_CAM = se3.exp(np.array([-1.2, 1.1, -1.3, 0.3, 0.1, 0.5]))
@@ -48,7 +48,7 @@ def truth_of(found: Trajectory, child: str, *, is_of_camera: bool = False) -> Ba
 
 def mounted() -> TfBuffer:
     buffer = TfBuffer()
-    buffer.add("base", "cam", 0, T_BASE_CAM, is_static=True)
+    add_transform(buffer, "base", "cam", 0, T_BASE_CAM, is_static=True)
     return buffer
 
 
@@ -123,7 +123,7 @@ def test_poses_of_a_frame_out_of_reach_are_not_compared(camera_frame: str, reaso
 def test_where_the_mount_is_not_known_the_poses_are_left_out() -> None:
     buffer = TfBuffer()
     for n in range(11):  # the camera turns on the base, for the first second
-        buffer.add("base", "cam", n * SECOND // 10, se3.exp(n * np.full(6, 0.1)))
+        add_transform(buffer, "base", "cam", n * SECOND // 10, se3.exp(n * np.full(6, 0.1)))
     found = framed(truth_of(trajectory(motion()), "base"), buffer, camera_frame="cam")
     expected = np.stack([motion()[n] @ se3.exp(n * np.full(6, 0.1)) for n in range(11)])
     np.testing.assert_allclose(found.trajectory.T_world_frame, expected, atol=1e-9)
@@ -135,7 +135,7 @@ def test_an_estimate_is_moved_to_the_antenna(seed: int) -> None:
     """A turning body draws other circles with its camera than with its antenna."""
     buffer = mounted()
     T_base_gps = se3.exp(np.array([0.1, 0.2, 0.3, -1.0, 0.5, 2.0]))
-    buffer.add("base", "gps", 0, T_base_gps, is_static=True)
+    add_transform(buffer, "base", "gps", 0, T_base_gps, is_static=True)
     T_map_base = motion(seed=seed)
     antenna = (T_map_base @ T_base_gps)[:, :3, 3]
     stamps_ns = trajectory(T_map_base).stamps_ns
@@ -154,7 +154,7 @@ def test_an_antenna_whose_place_is_not_known_is_compared_with_a_warning() -> Non
     positions = Trajectory.of_positions(np.arange(3), np.eye(3))
     moving = TfBuffer()
     for n in range(3):
-        moving.add("cam", "gps", n, se3.exp(n * np.ones(6)))
+        add_transform(moving, "cam", "gps", n, se3.exp(n * np.ones(6)))
     for buffer, reason in ((TfBuffer(), "holds no frame"), (moving, "tf moves gps against cam")):
         found = framed(truth_of(positions, "gps"), buffer, camera_frame="cam")
         assert reason in found.warning
