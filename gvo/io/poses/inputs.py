@@ -72,29 +72,13 @@ def is_in_bag(text: str) -> bool:
     return bool(mark) and exists(Path(path))
 
 
-def read_poses(text: str) -> Trajectory:
-    """Read poses from a file, or out of a bag.
-
-    Parameters
-    ----------
-    text : str
-        A file of poses, `BAG#tf:PARENT:CHILD`, `BAG#TOPIC`, or a bag that names its ground truth.
-
-    Raises
-    ------
-    TrajectoryError, RecordingError
-        When they cannot be read.
-    """
-    return read_pose_input(text).trajectory
-
-
 def read_pose_input(text: str, *, frame: str = "") -> PoseInput:
     """Read poses from a file, or out of a bag, with what is known about them.
 
     Parameters
     ----------
     text : str
-        As of `read_poses`.
+        A file of poses, `BAG#tf:PARENT:CHILD`, `BAG#TOPIC`, or a bag that names its ground truth.
     frame : str
         The frame that the poses are to be of, by its name in the bag's tf; empty: as they are.
 
@@ -339,7 +323,7 @@ def read_ground_truth(path: str | Path) -> Trajectory:
         When the file holds no poses, or the recording no ground truth.
     """
     if is_in_bag(str(path)) or (Path(path).is_dir() and is_bag(Path(path))):
-        return read_poses(str(path))
+        return read_pose_input(str(path)).trajectory
     path = Path(path)
     if (path / "groundtruth.txt").is_file():
         return read_trajectory(path / "groundtruth.txt")

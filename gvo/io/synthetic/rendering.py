@@ -32,14 +32,9 @@ _CULLED_ROWS = 8  # what is in view is found out from the poses of every eighth 
 
 
 def render_image(
-    scene: Scene,
-    T_map_cam: FloatArray,
-    camera: PinholeCamera,
-    *,
-    is_antialiased: bool = True,
-    beyond: Plane | None = None,
+    scene: Scene, T_map_cam: FloatArray, camera: PinholeCamera, *, beyond: Plane | None = None
 ) -> SampleArray:
-    """Render a grey image without noise.
+    """Render a grey image without noise, by four samples for the pixels where surfaces meet.
 
     Parameters
     ----------
@@ -48,8 +43,6 @@ def render_image(
     T_map_cam : ndarray of float64, shape (4, 4) or (height, 4, 4)
         Maps camera coordinates to the map, metres; of the image or of each of its rows.
     camera : PinholeCamera
-    is_antialiased : bool
-        Four samples for the pixels where surfaces meet; otherwise one for each pixel.
     beyond : (ndarray of float64, ndarray of float64), optional
         Point and normal of a plane that cuts away what is before it, see `look`.
 
@@ -59,11 +52,9 @@ def render_image(
         Grey values, 0 to 255 where the light does not exceed the texture's.
     """
     view = look(scene, T_map_cam, camera, beyond=beyond)
-    if not is_antialiased:
-        return _shade_rows(view, find_visible(view))
     fine = find_visible(refine(view))
     corners = [np.ascontiguousarray(fine[i::2, j::2]) for i in (0, 1) for j in (0, 1)]
-    image = _shade_rows(view, corners[0])
+    image = shade_rows(view, corners[0])
     is_mixed = np.any([corner != corners[0] for corner in corners[1:]], axis=0)
     v, u = np.nonzero(is_mixed)
     total = np.zeros(len(u), dtype=np.float32)
@@ -436,7 +427,7 @@ def _cut_out(
         mask &= view.scene.atlas.is_opaque(int(view.scene.textures[view.indices[k]]), level, s, t)
 
 
-def _shade_rows(view: View, visible: IndexArray) -> SampleArray:
+def shade_rows(view: View, visible: IndexArray) -> SampleArray:
     """Shade one sample at the centre of each pixel."""
     height, width = view.camera.height, view.camera.width
     image = np.empty((height, width), dtype=np.float32)

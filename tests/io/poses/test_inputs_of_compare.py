@@ -7,7 +7,7 @@ import pytest
 
 from gvo.errors import GvoError, RecordingError, TrajectoryError
 from gvo.geometry import se3
-from gvo.io.poses.inputs import is_in_bag, read_pose_input, read_poses
+from gvo.io.poses.inputs import is_in_bag, read_pose_input
 from gvo.trajectory.evaluation import Evaluation, evaluate
 from gvo.trajectory.formats import write_tum
 from gvo.trajectory.trajectory import Trajectory
@@ -16,6 +16,10 @@ from tests.io.pose_bags import ODOMETRY, STAMPED, PoseBag
 
 T_BASE_CAM = se3.exp(np.array([0.4, -0.8, 1.0, 0.3, 0.1, 0.5]))
 MOTION = se3.exp(np.outer(np.arange(8), [0.1, 0.0, -0.2, 1.0, 0.5, 0.1]))
+
+
+def read_poses(text: str) -> Trajectory:
+    return read_pose_input(text).trajectory
 
 
 @pytest.fixture
