@@ -50,8 +50,6 @@ class PoseInput:
     trajectory : Trajectory
     child_frame : str
         Whose poses they are; empty where that is not known.
-    decision : str
-        What was read, in one line; empty for a file.
     warning : str
         What could not be read, or that they are of another frame than the reference; empty if
         none.
@@ -60,7 +58,6 @@ class PoseInput:
     name: str
     trajectory: Trajectory
     child_frame: str = ""
-    decision: str = ""
     warning: str = ""
 
 
@@ -93,9 +90,8 @@ def read_pose_input(text: str, *, frame: str = "") -> PoseInput:
     """
     if not is_in_bag(text):
         trajectory = read_trajectory(text)
-        return PoseInput(
-            name=Path(text).stem, trajectory=trajectory, warning=_repeats(text, trajectory)
-        )
+        warning = _repeats(text, trajectory)
+        return PoseInput(name=Path(text).stem, trajectory=trajectory, warning=warning)
     path, _, what = (text, "", "") if exists(Path(text)) else text.partition(_MARK)
     reader = BagReader(Path(path))
     truth = _read(reader, what, path)
@@ -104,7 +100,6 @@ def read_pose_input(text: str, *, frame: str = "") -> PoseInput:
         trajectory=truth.trajectory,
         # what is named ground truth is of the camera, whatever frame it has
         child_frame="" if truth.is_of_camera else _OWN_FRAME.sub("", truth.child_frame),
-        decision=truth.decision,
         warning=reader.damage,
     )
     if not frame or found.child_frame in ("", frame):
@@ -138,9 +133,7 @@ def _brought(found: PoseInput, truth: BagTruth, reader: BagReader, frame: str) -
         tree = read_tf(reader, frames=(truth.child_frame, frame))
         framed = in_frame(truth, tree, base_frame=frame)
         if not isinstance(framed, Failure):
-            return replace(
-                found, trajectory=framed.trajectory, child_frame=frame, decision=framed.decision
-            )
+            return replace(found, trajectory=framed.trajectory, child_frame=frame)
         reason = framed.reason
     apart = f"{found.name} is of {truth.child_frame}, the reference of {frame}: {reason}"
     return replace(found, warning="; ".join(filter(None, [found.warning, apart])))

@@ -7,7 +7,6 @@ import sys
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
 from io import BytesIO
 from operator import attrgetter
 from pathlib import Path
@@ -117,23 +116,7 @@ class Window:
             tail = data[len(data) - len(pattern) + 1 :]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Inflated:
-    """The decompressed content of a part of a file.
-
-    Parameters
-    ----------
-    data : bytes
-        The content, or its start.
-    is_cut : bool
-        The compressed data are truncated.
-    """
-
-    data: bytes
-    is_cut: bool
-
-
-def inflate(window: Window, compression: str, *, limit: int = MAX_INFLATED) -> Inflated:
+def inflate(window: Window, compression: str, *, limit: int = MAX_INFLATED) -> tuple[bytes, bool]:
     """Decompress from a window; skip the compressed bytes.
 
     Parameters
@@ -143,6 +126,13 @@ def inflate(window: Window, compression: str, *, limit: int = MAX_INFLATED) -> I
         "bz2", "lz4" or "zstd".
     limit : int
         Maximum number of decompressed bytes.
+
+    Returns
+    -------
+    bytes
+        The content, or its start.
+    bool
+        Whether the compressed data are truncated.
 
     Raises
     ------
@@ -166,8 +156,8 @@ def inflate(window: Window, compression: str, *, limit: int = MAX_INFLATED) -> I
             piece = b""
             if decompressor.eof:
                 window.position -= len(decompressor.unused_data or b"")
-                return Inflated(data=b"".join(parts), is_cut=False)
-    return Inflated(data=b"".join(parts), is_cut=True)
+                return b"".join(parts), False
+    return b"".join(parts), True
 
 
 def inflate_whole(data: bytes, compression: str, *, limit: int | None = None) -> bytes:
@@ -210,10 +200,10 @@ def inflate_message(data: bytes) -> bytes:
     if not data.startswith(ZSTD_MAGIC):
         return data
     try:
-        inflated = inflate(Window(BytesIO(data), 0, len(data)), "zstd")
+        content, is_cut = inflate(Window(BytesIO(data), 0, len(data)), "zstd")
     except DamageError:
         return data  # the decoder of the message reports it
-    return data if inflated.is_cut else inflated.data
+    return data if is_cut else content
 
 
 def inflate_file(source: Path, target: Path) -> str:
@@ -396,16 +386,16 @@ class Scan(ABC):
     ) -> list[Entry]:
         """Return the messages of a compressed chunk; skip its compressed bytes."""
         start = part.position
-        inflated = inflate(part, compression, limit=limit)
-        if inflated.is_cut and part.end < self._n_bytes:
+        content, is_cut = inflate(part, compression, limit=limit)
+        if is_cut and part.end < self._n_bytes:
             # Only a chunk at the end of a truncated file may itself be truncated.
             raise DamageError(f"a chunk of {compression} that does not inflate")
-        if crc and not inflated.is_cut and crc32(inflated.data) != crc:
+        if crc and not is_cut and crc32(content) != crc:
             raise DamageError("a chunk whose checksum does not fit")
-        n_bytes = len(inflated.data)
-        inner = Window(BytesIO(inflated.data), 0, n_bytes)
+        n_bytes = len(content)
+        inner = Window(BytesIO(content), 0, n_bytes)
         entries, reason = self._read_chunk(inner)
-        if inflated.is_cut:
+        if is_cut:
             reason = f"a chunk is cut after {part.position - start} bytes"
         if reason:
             n_lost = round((part.position - start) * inner.rest / max(n_bytes, 1))
