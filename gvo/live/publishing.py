@@ -89,19 +89,15 @@ class LiveMessages:
 
     def _placed_result(self, result: FrameResult) -> FrameResult:
         T = self._T_set_world
+        T_map_world = T @ result.T_map_world @ se3.invert(T)
+        raw, causal, *rest = self._placed([result.raw, result.causal, *result.finished])
         return replace(
-            result,
-            raw=self._placed([result.raw])[0],
-            causal=self._placed([result.causal])[0],
-            finished=self._placed(result.finished),
-            T_map_world=T @ result.T_map_world @ se3.invert(T),
+            result, raw=raw, causal=causal, finished=tuple(rest), T_map_world=T_map_world
         )
 
     def _placed(self, estimates: Iterable[Estimate]) -> tuple[Estimate, ...]:
         T = self._T_set_world
-        return tuple(
-            replace(estimate, T_world_frame=T @ estimate.T_world_frame) for estimate in estimates
-        )
+        return tuple(replace(each, T_world_frame=T @ each.T_world_frame) for each in estimates)
 
 
 class Arrivals(AbstractContextManager["Arrivals"]):
