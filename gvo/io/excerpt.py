@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from gvo.errors import ConfigurationError, RecordingError
-from gvo.io.sync import Pair
+from gvo.io.sync import Paired
 from gvo.types import FaultyFrame
 
 
@@ -99,9 +99,7 @@ def make_excerpt(start_s: float, duration_s: float | None, every: int) -> Excerp
         raise ConfigurationError(f"--start, --duration, --every: {error}") from error
 
 
-def take_excerpt(
-    items: Iterable[Pair | FaultyFrame], excerpt: Excerpt
-) -> Iterator[Pair | FaultyFrame]:
+def take_excerpt(items: Iterable[Paired], excerpt: Excerpt) -> Iterator[Paired]:
     """Take a part of what `pair_images` gives.
 
     The pairs are those of the whole recording; none of them is decoded here.

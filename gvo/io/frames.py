@@ -22,7 +22,7 @@ from gvo.io.depth_registration import DepthRegistration
 from gvo.io.excerpt import Excerpt, take_excerpt
 from gvo.io.images import depth_from_counts, depth_from_metres
 from gvo.io.recording import DepthView, RecordingInfo, Sensor, Source, StampedImage
-from gvo.io.sync import Pair, StampFilter, pair_images
+from gvo.io.sync import Paired, StampFilter, pair_images
 from gvo.types import DepthArray, FaultyFrame, Frame, ImageArray, RgbdFrame, StereoFrame
 
 _ROW_STEP = 64
@@ -31,13 +31,12 @@ _N_AHEAD = 2
 _MILLIMETRES = 1000.0
 # What reading or decoding one image may raise besides, in a source of one's own as well.
 _LOAD_ERRORS = (OSError, MemoryError, ValueError, cv2.error)
-_Item: TypeAlias = Pair | FaultyFrame
 _Preparers: TypeAlias = tuple["ImagePreparer", "ImagePreparer"]
-Through: TypeAlias = Callable[[Iterator[_Item]], Iterator[_Item]]
+Through: TypeAlias = Callable[[Iterator[Paired]], Iterator[Paired]]
 """What pairs go through before they are decoded."""
 _Prepared: TypeAlias = NDArray[Any] | str
 _Jobs: TypeAlias = Sequence[Callable[[], _Prepared]]
-_Started: TypeAlias = tuple[_Item, _Jobs]
+_Started: TypeAlias = tuple[Paired, _Jobs]
 
 
 def frames(
@@ -109,7 +108,7 @@ def paired(
     *,
     limit_ms: float | None = None,
     is_prompt: bool = False,
-) -> Iterator[Pair | FaultyFrame]:
+) -> Iterator[Paired]:
     """Pair the images of a recording as configured, see `pair_images`.
 
     Parameters
@@ -165,7 +164,7 @@ def pair_limit_key(sensor: Sensor) -> str:
 
 
 def _decoded(
-    items: Iterator[_Item], preparers: _Preparers, info: RecordingInfo, n_threads: int, n_ahead: int
+    items: Iterator[Paired], preparers: _Preparers, info: RecordingInfo, threads: int, n_ahead: int
 ) -> Iterator[Frame | FaultyFrame]:
     """Yield the frames of pairs, decoded side by side and ahead where there is a second thread."""
     with ThreadPoolExecutor(max_workers=2, thread_name_prefix="decode") as pool:
@@ -181,7 +180,7 @@ def _decoded(
             else:
                 pair = () if isinstance(item, FaultyFrame) else zip(item, preparers, strict=True)
                 jobs = [partial(_prepare, *job, info) for job in pair]
-                is_alone = n_threads == 1
+                is_alone = threads == 1
                 started.append(
                     (item, jobs if is_alone else [pool.submit(job).result for job in jobs])
                 )
@@ -193,7 +192,7 @@ def _decoded(
             raise fault
 
 
-def _finish(item: _Item, jobs: _Jobs, sensor: Sensor) -> Frame | FaultyFrame:
+def _finish(item: Paired, jobs: _Jobs, sensor: Sensor) -> Frame | FaultyFrame:
     if isinstance(item, FaultyFrame):
         return item
     first, second = (result() for result in jobs)

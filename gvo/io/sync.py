@@ -13,6 +13,9 @@ from gvo.io.recording import StampedImage
 from gvo.types import FaultyFrame
 
 Pair: TypeAlias = tuple[StampedImage, StampedImage]
+Paired: TypeAlias = Pair | FaultyFrame
+"""A pair, or the image of stream 0 that became none."""
+
 # A step so long is a gap, or a stamp gone wrong: the next images tell.
 _LEAP_NS = 1_000_000_000
 # So many images in a row that are all after the leap: it was a gap.
@@ -30,7 +33,7 @@ def pair_images(
     queue_size: int = 100,
     age_penalty: float = 0.1,
     is_prompt: bool = False,
-) -> Iterator[Pair | FaultyFrame]:
+) -> Iterator[Paired]:
     """Pair the images of stream 0 with those of stream 1.
 
     Without a tolerance images of equal stamps are paired, by the policy ExactTime of
@@ -100,7 +103,7 @@ def pair_images(
 
 def _paired(
     images: Iterable[StampedImage], policy: _ExactTime | _ApproximateTime, answers: _Answers
-) -> Iterator[Pair | FaultyFrame]:
+) -> Iterator[Paired]:
     try:
         for image in images:
             policy.push(image)
@@ -118,11 +121,11 @@ class _Answers:
 
     def __init__(self, limit_ns: int, partner: str, queue_size: int) -> None:
         self._limit_ns, self._partner, self._queue_size = limit_ns, partner, queue_size
-        self._ready: list[Pair | FaultyFrame] = []
+        self._ready: list[Paired] = []
         self._passed_ns: int | None = None  # the last stamp of stream 1 that was dealt with
         self.last_ns: int | None = None  # of the last pair
 
-    def take(self) -> list[Pair | FaultyFrame]:
+    def take(self) -> list[Paired]:
         """Return the answers since the last call."""
         ready, self._ready = self._ready, []
         return ready

@@ -22,7 +22,7 @@ from gvo.io.bag.messages import transform_of
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.io.run_folder.writer import free_path
-from gvo.io.sync import Pair
+from gvo.io.sync import Pair, Paired
 from gvo.live.publishing import Arrivals, LiveMessages
 from gvo.live.transport import SET_POSE, TRIGGER, NetworkWriter, Parameters, Service, Sink
 from gvo.odometry.odometry import Odometry
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from gvo.viz.view.live import LivePlayer
 
 _OnProgress: TypeAlias = Callable[[Progress], None]
-_Item: TypeAlias = Pair | FaultyFrame
 # Frames that are tied to one another before any is dropped, and what waits for them at most.
 _N_TIED = 2
 _MAX_BEFORE_TIED = 300
@@ -391,7 +390,7 @@ class WaitingPairs:
                 f"expected max_waiting >= 1 and max_lag_s > 0, got {max_waiting} and {max_lag_s}"
             )
         self._max_waiting, self._max_lag_s = max_waiting, max_lag_s
-        self._items: deque[_Item] = deque()
+        self._items: deque[Paired] = deque()
         self._n_pairs = 0
         self._newest_ns, self._newest_s = 0, 0.0  # its stamp, and when it came
         self._taken_s: float | None = None
@@ -404,7 +403,7 @@ class WaitingPairs:
         self.n_dropped = 0
         self.on_pair: Callable[[int], None] = lambda _: None
 
-    def put(self, item: _Item) -> None:
+    def put(self, item: Paired) -> None:
         """Add a pair, or a frame without one; called by the thread that receives."""
         with self._changed:
             self._items.append(item)
@@ -436,7 +435,7 @@ class WaitingPairs:
         if self._taken_s is not None:
             self._tracking_s.append(time.perf_counter() - self._taken_s)
 
-    def take(self) -> _Item | None:
+    def take(self) -> Paired | None:
         """Return the oldest one, waiting for it; None after the end.
 
         Raises
@@ -459,7 +458,7 @@ class WaitingPairs:
         waited_s, self._waited_s = self._waited_s, 0.0
         return waited_s
 
-    def _take(self) -> _Item | None:
+    def _take(self) -> Paired | None:
         with self._changed:
             if not self._items:
                 if self._fault is not None:
@@ -479,14 +478,14 @@ class WaitingPairs:
             self._taken_s = now_s
             return item
 
-    def through(self, items: Iterable[_Item]) -> Iterator[_Item]:
+    def through(self, items: Iterable[Paired]) -> Iterator[Paired]:
         """Receive items in a thread of their own, and yield what is taken here."""
         receiver = threading.Thread(target=self._receive, args=(items,), daemon=True)
         receiver.start()
         while (item := self.take()) is not None:
             yield item
 
-    def _receive(self, items: Iterable[_Item]) -> None:
+    def _receive(self, items: Iterable[Paired]) -> None:
         try:
             for item in items:
                 if self._is_closed:
