@@ -202,6 +202,9 @@ def _wrong_poses_are_told(fault: NamedFault, outcome: Outcome, source: FaultySou
         and (row["segment"] == "0" or k >= joined_at[row["segment"]])
         for k, (frame, row) in enumerate(zip(outcome.frames.tolist(), rows, strict=True))
     ])  # fmt: skip
+    # Of what is left after blurred images the covariance tells that it is hardly known.
+    sigmas_m = np.sqrt(np.trace(outcome.covariances[:, 3:, 3:], axis1=1, axis2=2))
+    is_sound &= sigmas_m < 2.0 * _MAX_ERROR_M
     assert outcome.errors_m[is_sound].max(initial=0.0) <= _MAX_ERROR_M
     assert outcome.deviations.max() <= _MAX_DEVIATION
 
