@@ -114,12 +114,9 @@ class FinishedPage:
         self._view = panels.ViewPoint(server, up, is_following=False)
         self._painter = panels.Painter(self.draw)
         self._sigmas = panels.add_scene_controls(
-            server.gui,
-            self.scene,
-            without=self._absent,
-            n_sigmas=start_sigmas(record),
-            redraw=self._painter.offer,
+            server.gui, self.scene, self._absent, start_sigmas(record)
         )
+        self._sigmas.on_update(lambda _: self._painter.offer())
         self._sigmas.visible = "ellipsoids" not in self._absent
         self._show_all()
         self.player.seek(self.player.n_frames - 1)

@@ -128,8 +128,7 @@ class History:
         # Of each frame with a pose: its index and stamp, and its raw and causal pose. Of each final
         # smoothed pose: the index of the frame with which it became final, its stamp, and the pose.
         self._tracked = _Rows(2, np.int64)
-        self._raw = _Rows(16, np.float64)
-        self._causal = _Rows(16, np.float64)
+        self._poses = {name: _Rows(16, np.float64) for name in ("raw", "causal")}
         self._finishing = _Rows(2, np.int64)
         self._finished = _Rows(16, np.float64)
         self._keyframes: list[int] = []
@@ -153,8 +152,8 @@ class History:
             if result is None:
                 return
             self._tracked.append((index, record.stamp_ns))
-            self._raw.append(result.raw.T_world_frame.ravel())
-            self._causal.append(result.causal.T_world_frame.ravel())
+            self._poses["raw"].append(result.raw.T_world_frame.ravel())
+            self._poses["causal"].append(result.causal.T_world_frame.ravel())
             self._note_finished(index, result.finished)
             if record.stamp_ns in result.keyframes_ns:
                 self._keyframes.append(index)
@@ -204,28 +203,24 @@ class History:
         with self._lock:
             index = self.shown if index is None else index
             record = self._record(index)
-            n = self._n_tracked(index)
+            _, causal = self._known("causal", index)
+            T = causal[-1] if len(causal) else np.eye(4)
             return FrameView.of(
-                record,
-                index=index,
-                n_done=self.n_done,
-                T_world_frame=self._causal.rows[n - 1].reshape(4, 4) if n else np.eye(4),
-                fault=fault,
+                record, index=index, n_done=self.n_done, T_world_frame=T, fault=fault
             )
 
-    def raw_path(self) -> Path:
-        """Return stamps (n,) and positions (n, 3) of the raw chain."""
-        return self._path(self._raw)
+    def path(self, name: str) -> Path:
+        """Return stamps (n,) and positions (n, 3) up to the frame shown.
 
-    def causal_path(self) -> Path:
-        """Return stamps (n,) and positions (n, 3) as they were known when each frame came."""
-        return self._path(self._causal)
-
-    def smoothed_path(self) -> Path:
-        """Return stamps (n,) and positions (n, 3) as of the frame shown."""
+        Parameters
+        ----------
+        name : {"raw", "causal", "smoothed"}
+            The raw chain; poses as they were known when each frame came; as of the frame shown.
+        """
         with self._lock:
-            stamps_ns, T_world_frame = self._smoothed()
-            return stamps_ns, T_world_frame[:, :3, 3]
+            is_smoothed = name == "smoothed"
+            stamps_ns, poses = self._smoothed() if is_smoothed else self._known(name, self.shown)
+            return stamps_ns.copy(), poses[:, :3, 3].copy()
 
     def loop_lines(self) -> FloatArray:
         """Return both ends of the loops so far as of the frame shown, shape (n, 2, 3), metres."""
@@ -263,22 +258,16 @@ class History:
             self._latest = index, _record_of(*self._told[row], self._arrays[row])
         return self._latest[1]
 
-    def _n_tracked(self, index: int) -> int:
-        """Return how many frames up to one have a pose."""
-        return int(np.searchsorted(self._tracked.rows[:, 0], index, side="right"))
-
-    def _path(self, poses: _Rows) -> Path:
-        with self._lock:
-            n = self._n_tracked(self.shown)
-            stamps_ns = self._tracked.rows[:n, 1].copy()
-            return stamps_ns, poses.rows[:n].reshape(-1, 4, 4)[:, :3, 3].copy()
+    def _known(self, name: str, index: int) -> tuple[IntArray, FloatArray]:
+        """Return stamps and raw or causal poses of all frames up to one."""
+        n = int(np.searchsorted(self._tracked.rows[:, 0], index, side="right"))
+        return self._tracked.rows[:n, 1], self._poses[name].rows[:n].reshape(-1, 4, 4)
 
     def _smoothed(self) -> tuple[IntArray, FloatArray]:
         """Return stamps and the best poses as of the frame shown: final, window or causal."""
-        n = self._n_tracked(self.shown)
-        stamps_ns = self._tracked.rows[:n, 1].copy()
-        poses = self._causal.rows[:n].reshape(-1, 4, 4).copy()
-        if n == 0:
+        stamps_ns, causal = self._known("causal", self.shown)
+        poses = causal.copy()
+        if len(stamps_ns) == 0:
             return stamps_ns, poses
         window = self._record(self.shown).window_poses
         known = [stamp_ns for stamp_ns in window if stamp_ns <= stamps_ns[-1]]

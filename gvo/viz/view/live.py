@@ -18,6 +18,7 @@ from gvo.viz.view.tracking import FrameRecorder
 
 # Poses of a path that are kept; for one more every second is dropped.
 _N_POSES = 4096
+_PATHS = ("raw", "causal", "smoothed")
 
 
 class Adjustable(Protocol):
@@ -168,7 +169,7 @@ class LiveHistory:
         self._n = self._n_frames = 0
         self._stride = 1
         self._stamps_ns = np.zeros(_N_POSES, dtype=np.int64)
-        # Of each frame that is kept: raw, causal and best known position.
+        # Of each frame that is kept its position on each path, the smoothed one as best known.
         self._positions = np.zeros((_N_POSES, 3, 3))
         self._keyframes: dict[int, tuple[int, FloatArray]] = {}  # index and best pose, by stamp
         self._clouds = KeyframeClouds()
@@ -213,25 +214,21 @@ class LiveHistory:
                 if stamp_ns in self._keyframes:
                     self._keyframes[stamp_ns] = self._keyframes[stamp_ns][0], T
 
-    def raw_path(self) -> Path:
-        """Return stamps (n,) and positions (n, 3) of the raw chain."""
-        return self._path(0)
+    def path(self, name: str) -> Path:
+        """Return stamps (n,) and positions (n, 3).
 
-    def causal_path(self) -> Path:
-        """Return stamps (n,) and positions (n, 3) as they were known when each frame came."""
-        return self._path(1)
-
-    def smoothed_path(self) -> Path:
-        """Return stamps (n,) and positions (n, 3) as they are known now."""
-        return self._path(2)
-
-    def _path(self, which: int) -> Path:
+        Parameters
+        ----------
+        name : {"raw", "causal", "smoothed"}
+            The raw chain; poses as they were known when each frame came; as they are known now.
+        """
         with self._lock:
-            return self._stamps_ns[: self._n].copy(), self._positions[: self._n, which].copy()
+            positions = self._positions[: self._n, _PATHS.index(name)]
+            return self._stamps_ns[: self._n].copy(), positions.copy()
 
     def loop_lines(self) -> FloatArray:
         """Return both ends of the loops so far, shape (n, 2, 3), metres."""
-        stamps_ns, positions = self.smoothed_path()
+        stamps_ns, positions = self.path("smoothed")
         rows = np.searchsorted(stamps_ns, np.array(self._loops_ns, dtype=np.int64).reshape(-1, 2))
         return positions[np.minimum(rows, len(stamps_ns) - 1)]
 

@@ -141,13 +141,8 @@ class Page:
             "save as YAML", hint="For gvo run --config; the browser saves the file"
         ).on_click(self._on_save)
         self._state = gui.add_html(panels.state_html(player_state(self._player)))
-        self._sigmas = panels.add_scene_controls(
-            gui,
-            self.scene,
-            without=self._absent,
-            n_sigmas=_START_SIGMAS,
-            redraw=lambda: self._painter.offer(),
-        )
+        self._sigmas = panels.add_scene_controls(gui, self.scene, self._absent, _START_SIGMAS)
+        self._sigmas.on_update(lambda _: self._painter.offer())
         with gui.add_folder("Parameters", expand_by_default=False):
             self.controls = ParameterControls(
                 gui, self._player.config, apply=self._player.reconfigure, say=self._say
@@ -211,13 +206,11 @@ class Page:
         self.scene.show_pose(frame.T_world_frame)
 
     def _draw_paths(self) -> None:
-        history = self._player.history
-        self.scene.show_path("raw", history.raw_path()[1])
-        stamps_ns, positions = history.causal_path()
-        self.scene.show_path("causal", positions)
-        self.scene.show_path("smoothed", history.smoothed_path()[1])
+        paths = {name: self._player.history.path(name) for name in ("raw", "causal", "smoothed")}
+        for name, (_, positions) in paths.items():
+            self.scene.show_path(name, positions)
         if self._truth is not None:
-            self.scene.show_path("truth", self._truth.until(stamps_ns, positions))
+            self.scene.show_path("truth", self._truth.until(*paths["causal"]))
 
     def _draw_window(self, frame: FrameView) -> None:
         poses = frame.window_poses

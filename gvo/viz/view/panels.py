@@ -63,18 +63,12 @@ def add_frame_panel(server: viser.ViserServer) -> Any:  # noqa: ANN401 - a tab o
 
 
 def add_scene_controls(
-    gui: viser.GuiApi,
-    scene: Scene,
-    *,
-    without: Collection[str],
-    n_sigmas: int,
-    redraw: Callable[[], None],
+    gui: viser.GuiApi, scene: Scene, without: Collection[str], n_sigmas: int
 ) -> Any:  # noqa: ANN401 - a slider of viser's
     """Add the size of the ellipsoids, which is returned, and a check box for each layer."""
     sigmas = gui.add_slider(
         "ellipsoid sigmas", 1, 100, 1, n_sigmas, hint="Half axes of the ellipsoids"
     )
-    sigmas.on_update(lambda _: redraw())
     with gui.add_folder("Show", expand_by_default=False):
         for layer in LAYERS:
             if layer not in without:
@@ -298,7 +292,8 @@ class PauseButtons:
         before: Callable[[], None],
     ) -> None:
         self._shown, self._before = playable, before
-        gui.add_button_group(self._LABEL, self._NAMES).on_click(self._on_click)
+        buttons = gui.add_button_group(self._LABEL, self._NAMES)
+        buttons.on_click(lambda event: self.press(event.target.value))
         gui.add_command("play or pause", hotkey="P").on_trigger(lambda _: self.toggle())
 
     def press(self, name: str) -> None:
@@ -312,9 +307,6 @@ class PauseButtons:
 
     def show(self, index: int) -> None:
         """Take the number of the frame that is shown."""
-
-    def _on_click(self, event: viser.GuiEvent[Any]) -> None:
-        self.press(event.target.value)
 
 
 class Playback(PauseButtons):

@@ -6,8 +6,8 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from typing import TypeAlias
 
@@ -69,7 +69,7 @@ class Player(AbstractContextManager["Player"]):
     >>> recording = SyntheticRecording("handheld", "rgbd", n_frames=3, scale=0.25)
     >>> with Player(lambda config: recording, Config()) as player:
     ...     player.seek(2)
-    ...     player.wait(), player.index, len(player.history.raw_path()[0])
+    ...     player.wait(), player.index, len(player.history.path("raw")[0])
     (True, 2, 3)
     """
 
@@ -97,29 +97,33 @@ class Player(AbstractContextManager["Player"]):
         self._thread = threading.Thread(target=self._work, name="player", daemon=True)
         self._thread.start()
 
+    @contextmanager
+    def _changing(self) -> Iterator[None]:
+        """Change what the thread waits for."""
+        with self._changed:
+            yield
+            self._changed.notify_all()
+
     # Commands
 
     def play(self) -> None:
         """Go on from the frame shown, at the speed that is set."""
-        with self._changed:
+        with self._changing():
             self.is_playing = True
             self._due_s = -math.inf
-            self._changed.notify_all()
 
     def pause(self) -> None:
         """Stop, also on the way to a frame."""
-        with self._changed:
+        with self._changing():
             self.is_playing = self._is_stepping = False
             self._goal = None
-            self._changed.notify_all()
 
     def step(self) -> None:
         """Show the next frame and pause; calls add up."""
-        with self._changed:
+        with self._changing():
             base = self._goal if self._is_stepping and self._goal is not None else self.index
             self._goal = base + 1
             self._is_stepping, self.is_playing = True, False
-            self._changed.notify_all()
 
     def seek(self, index: int) -> None:
         """Show a frame, as soon as all frames up to it are computed; playing goes on from there.
@@ -129,10 +133,9 @@ class Player(AbstractContextManager["Player"]):
         index : int
             Of the frame in the recording; clipped to the first and the last one.
         """
-        with self._changed:
+        with self._changing():
             self._goal = max(int(index), self.first_index)
             self._is_stepping = False
-            self._changed.notify_all()
 
     def set_speed(self, factor: float | None) -> None:
         """Play by the recording's stamps, or as fast as possible; no frame is left out.
@@ -149,9 +152,8 @@ class Player(AbstractContextManager["Player"]):
         """
         if factor is not None and not (math.isfinite(factor) and factor > 0):
             raise ValueError(f"the speed must be positive or None, got {factor}")
-        with self._changed:
+        with self._changing():
             self._speed = factor
-            self._changed.notify_all()
 
     def reconfigure(self, config: Config) -> None:
         """Compute with another configuration from the next frame on.
@@ -166,9 +168,8 @@ class Player(AbstractContextManager["Player"]):
         """
         if not isinstance(config, Config):
             raise ValueError(f"config must be a gvo.Config, got {type(config).__name__}")
-        with self._changed:
+        with self._changing():
             self.config, self.fault = config, ""
-            self._changed.notify_all()
 
     def restart(self, index: int | None = None) -> None:
         """Drop what was computed and begin anew, with the present configuration.
@@ -185,13 +186,12 @@ class Player(AbstractContextManager["Player"]):
         ValueError
             When the frame is not known yet.
         """
-        with self._changed:
+        with self._changing():
             index = max(self.index, 0) if index is None else int(index)
             if index != 0 and not self.first_index <= index < self.n_done:
                 raise ValueError(f"frame {index} is not known: {self.n_done} are done")
             self._restart_index = index
             self._goal, self._is_stepping = None, False
-            self._changed.notify_all()
 
     def subscribe(self, callback: Subscriber) -> Callable[[], None]:
         """Call back with each frame that is shown, on the thread of the player.
@@ -217,9 +217,8 @@ class Player(AbstractContextManager["Player"]):
 
     def close(self) -> None:
         """End the thread after the frame under way; the history can still be read."""
-        with self._changed:
+        with self._changing():
             self._is_closed = True
-            self._changed.notify_all()
         if threading.current_thread() is not self._thread:
             self._thread.join()
 
@@ -356,7 +355,7 @@ class Player(AbstractContextManager["Player"]):
         """Wait until the next frame is due; False where another command came."""
         gap_s = self._gap_s()
         with self._changed:
-            while self._is_only_playing():
+            while self.is_playing and not (self._is_asked() or self._is_closed):
                 pause_s = 0.0 if self._speed is None else gap_s / self._speed
                 now_s, due_s = time.monotonic(), self._due_s + pause_s
                 if now_s >= due_s:
@@ -365,9 +364,6 @@ class Player(AbstractContextManager["Player"]):
                     return True
                 self._changed.wait(due_s - now_s)
         return False
-
-    def _is_only_playing(self) -> bool:
-        return self.is_playing and not self._is_asked() and not self._is_closed
 
     def _is_asked(self) -> bool:
         return self._goal is not None or self._restart_index is not None

@@ -276,7 +276,7 @@ class Scene:
             shadow_opacity=0.0,
             infinite_grid=True,
             fade_distance=_N_GRID_CELLS * cell_m,
-            position=_position(center),
+            position=center,
         )
 
     def show_path(self, name: str, positions_world: FloatArray) -> None:
@@ -292,7 +292,7 @@ class Scene:
     def show_pose(self, T_world_frame: FloatArray) -> None:
         """Move the camera, with its image and points."""
         self._camera.wxyz = quaternions_wxyz(T_world_frame[np.newaxis, :3, :3])[0]
-        self._camera.position = _position(T_world_frame[:3, 3])
+        self._camera.position = T_world_frame[:3, 3]
 
     def show_image(self, image: ImageArray | None) -> None:
         """Show an RGB image (h, w, 3) in the camera."""
@@ -360,11 +360,6 @@ class Scene:
         self._nodes[layer].visible = is_visible
 
 
-def _position(position: FloatArray) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in position)
-    return x, y, z
-
-
 def _frustum_scale(fov: float, aspect: float, depth: float) -> float:
     """Return viser's scale, by the volume, of a frustum that is `depth` metres deep."""
     return float(depth * np.cbrt(aspect * np.tan(0.5 * fov) ** 2 / 3.0))
@@ -410,7 +405,7 @@ def position_ellipsoids(
 
 def quaternions_wxyz(rotations: FloatArray) -> FloatArray:
     """Return unit quaternions (n, 4), w first, of rotation matrices (n, 3, 3)."""
-    return np.roll(Rotation.from_matrix(rotations).as_quat(), 1, axis=-1)
+    return Rotation.from_matrix(rotations).as_quat(scalar_first=True)
 
 
 def position_sigmas(T_world_frame: FloatArray, covariance: FloatArray) -> FloatArray:

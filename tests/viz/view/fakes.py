@@ -83,14 +83,14 @@ class FakeHistory:
     def __init__(self) -> None:
         self.n = 0
 
-    def raw_path(self) -> tuple[IntArray, FloatArray]:
-        return stamps_of(self.n), self._positions() + np.array([0.1, 0.0, 0.0])
-
-    def causal_path(self) -> tuple[IntArray, FloatArray]:
-        return stamps_of(self.n), self._positions()
-
-    def smoothed_path(self) -> tuple[IntArray, FloatArray]:
-        return stamps_of(self.n)[:-1], self._positions()[:-1]
+    def path(self, name: str) -> tuple[IntArray, FloatArray]:
+        stamps_ns, positions = stamps_of(self.n), self._positions()
+        paths = {
+            "raw": (stamps_ns, positions + np.array([0.1, 0.0, 0.0])),
+            "causal": (stamps_ns, positions),
+            "smoothed": (stamps_ns[:-1], positions[:-1]),
+        }
+        return paths[name]
 
     def loop_lines(self) -> FloatArray:
         return self._positions()[[0, -1]][np.newaxis]

@@ -99,10 +99,10 @@ def test_paths_go_up_to_the_frame_shown_as_it_was_known_then(history: History) -
     for shown, expected in smoothed.items():
         history.show(shown)
         frames = [frame for frame in (2, 3, 5, 6) if frame <= shown]
-        assert xs(history.smoothed_path()) == expected
-        assert xs(history.raw_path()) == [frame + 0.1 for frame in frames]
-        assert xs(history.causal_path()) == [frame + 0.2 for frame in frames]
-        assert history.raw_path()[0].tolist() == [10 * frame for frame in frames]
+        assert xs(history.path("smoothed")) == expected
+        assert xs(history.path("raw")) == [frame + 0.1 for frame in frames]
+        assert xs(history.path("causal")) == [frame + 0.2 for frame in frames]
+        assert history.path("raw")[0].tolist() == [10 * frame for frame in frames]
 
 
 def test_loops_join_the_best_poses_as_of_the_frame_shown() -> None:
@@ -147,7 +147,7 @@ def test_frames_that_are_not_there_are_refused(history: History, index: int) -> 
 
 def test_nothing_done_gives_empty_paths_and_no_cloud() -> None:
     history = History()
-    assert xs(history.smoothed_path()) == xs(history.raw_path()) == []
+    assert xs(history.path("smoothed")) == xs(history.path("raw")) == []
     assert [len(part) for part in history.accumulated_cloud()] == [0, 0]
 
 
@@ -167,7 +167,7 @@ def test_many_frames_grow_the_arrays() -> None:
     for frame in range(200):
         history.add(record(frame))
     history.show(199)
-    assert xs(history.raw_path()) == [round(frame + 0.1, 6) for frame in range(200)]
+    assert xs(history.path("raw")) == [round(frame + 0.1, 6) for frame in range(200)]
 
 
 def test_a_grid_of_known_depth_is_projected_back() -> None:

@@ -50,7 +50,7 @@ def test_it_plays_pauses_steps_and_goes_back(page: ViewPage, player: Player) -> 
     at = player.index
     page.wait_for_frame(at)
     assert 5 <= at < player.n_frames - 1
-    assert len(player.history.causal_path()[0]) == at + 1
+    assert len(player.history.path("causal")[0]) == at + 1
     assert not player.is_playing
     later = page.scene()
     assert n_colours(later) > 20
@@ -60,7 +60,7 @@ def test_it_plays_pauses_steps_and_goes_back(page: ViewPage, player: Player) -> 
     page.wait_for_frame(at + 1)
     page.move_slider("frame", -2)
     page.wait_for_frame(at - 1)
-    assert len(player.history.causal_path()[0]) == at
+    assert len(player.history.path("causal")[0]) == at
     assert player.n_done == at + 2
 
 
@@ -99,7 +99,7 @@ def test_a_parameter_changes_the_next_frame_and_is_saved(page: ViewPage, player:
     assert player.wait(30.0), "frame 1 is not tracked anew"
     page.press("step")
     page.wait_for_frame(2)
-    assert len(player.history.causal_path()[0]) == 2, "the world does not begin at frame 1"
+    assert len(player.history.path("causal")[0]) == 2, "the world does not begin at frame 1"
 
 
 def test_the_page_of_a_finished_run_plays_and_seeks(browser: Browser, tmp_path: Path) -> None:

@@ -82,9 +82,9 @@ def test_the_newest_frame_is_shown_with_all_paths(player: LivePlayer, window: Fa
     assert (view.index, player.n_frames) == (4, 5)
     np.testing.assert_array_equal(view.T_world_frame, pose_of(4))
     assert {*view.window_poses} == {PERIOD_NS * index for index in (2, 3, 4)}
-    for path in (player.history.raw_path(), player.history.causal_path()):
+    for path in (player.history.path("raw"), player.history.path("causal")):
         np.testing.assert_array_equal(path[1][:, 2], np.arange(5.0))
-    np.testing.assert_array_equal(player.history.smoothed_path()[1][:, 0], [0.5] * 5)
+    np.testing.assert_array_equal(player.history.path("smoothed")[1][:, 0], [0.5] * 5)
     assert player.frame_view is view
 
 
@@ -116,7 +116,7 @@ def test_while_it_is_paused_or_nobody_looks_only_poses_are_noted(
     view = player.frame_view
     assert view is not None
     assert view.index == 0
-    assert len(player.history.causal_path()[0]) == 3
+    assert len(player.history.path("causal")[0]) == 3
 
 
 def test_a_new_run_begins_without_former_paths(player: LivePlayer, window: FakeWindow) -> None:
@@ -125,7 +125,7 @@ def test_a_new_run_begins_without_former_paths(player: LivePlayer, window: FakeW
     player.begin(cast(Any, window))
     add(player, window, 2)
     assert (player.first_index, player.n_done) == (2, 3)
-    assert len(player.history.causal_path()[0]) == 1
+    assert len(player.history.path("causal")[0]) == 1
 
 
 def test_a_long_path_keeps_its_shape_in_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -133,7 +133,7 @@ def test_a_long_path_keeps_its_shape_in_bounded_memory(monkeypatch: pytest.Monke
     history = LiveHistory()
     for index in range(1000):
         history.add(result_of(index))
-    stamps_ns, positions = history.causal_path()
+    stamps_ns, positions = history.path("causal")
     assert 32 <= len(stamps_ns) <= 64
     np.testing.assert_array_equal(positions[:, 2], stamps_ns / PERIOD_NS)
     assert stamps_ns[0] == 0
@@ -220,8 +220,11 @@ def test_a_run_is_shown_as_a_recording_is(tmp_path: Path) -> None:
         assert player.wait(60.0)
         expected = player.frame_view
         assert expected is not None
-        for name in ("raw_path", "causal_path", "smoothed_path", "accumulated_cloud"):
-            found, wanted = (getattr(each.history, name)() for each in (shown, player))
+        for name in ("raw", "causal", "smoothed", "cloud"):
+            found, wanted = (
+                each.history.accumulated_cloud() if name == "cloud" else each.history.path(name)
+                for each in (shown, player)
+            )
             for one, other in zip(found, wanted, strict=True):
                 np.testing.assert_array_equal(one, other, err_msg=name)
     assert view.index == expected.index == 3

@@ -121,11 +121,11 @@ def test_playing_shows_each_frame_once_with_the_poses_of_a_run(player: Player) -
         assert view.keyframes == result.keyframes_ns
         assert set(view.keyframes) <= set(view.window_poses)
         assert set(view.window_poses) == set(view.window_covariances)
-    paths = player.history.raw_path(), player.history.causal_path()
+    paths = player.history.path("raw"), player.history.path("causal")
     for (stamps, path), kind in zip(paths, ("raw", "causal"), strict=True):
         assert stamps.tolist() == stamps_ns()
         assert path.tolist() == positions([getattr(result, kind) for result in results])
-    stamps, path = player.history.smoothed_path()
+    stamps, path = player.history.path("smoothed")
     assert stamps.tolist() == stamps_ns()
     assert path.tolist() == positions(list(smoothed))
 
@@ -141,8 +141,8 @@ def test_a_frame_that_is_done_is_shown_as_it_was(player: Player) -> None:
     np.testing.assert_array_equal(now.cloud[0], then.cloud[0])
     assert now.image.shape == then.image.shape
     assert np.abs(now.overlay.astype(int) - then.overlay).mean() < 6  # JPEG
-    assert len(player.history.raw_path()[0]) == 4
-    assert player.history.smoothed_path()[0].tolist() == stamps_ns()[:4]
+    assert len(player.history.path("raw")[0]) == 4
+    assert player.history.path("smoothed")[0].tolist() == stamps_ns()[:4]
 
 
 def test_steps_go_through_what_is_done_and_on(player: Player) -> None:
@@ -216,7 +216,7 @@ def test_after_a_restart_the_world_begins_at_the_frame_shown(player: Player) -> 
     assert (player.index, player.first_index, player.n_done) == (5, 5, 6)
     go(player, N_FRAMES - 1)
     results, smoothed = computed(5)
-    stamps, path = player.history.smoothed_path()
+    stamps, path = player.history.path("smoothed")
     assert stamps.tolist() == stamps_ns()[5:]
     assert path.tolist() == positions(list(smoothed))
     go(player, 0)
@@ -261,7 +261,7 @@ def test_what_matters_when_reading_opens_the_recording_again_without_a_gap(other
         assert recording.n_opened == 2
         assert [view.stamp_ns for view in views[:-1]] == stamps_ns()
         expected = positions([result.raw for result in computed()[0]])
-        assert player.history.raw_path()[1].tolist() == expected
+        assert player.history.path("raw")[1].tolist() == expected
 
 
 def test_a_configuration_that_cannot_be_read_with_leaves_the_former_one() -> None:
@@ -301,10 +301,10 @@ def test_a_faulty_frame_is_shown_without_result() -> None:
         assert view.status is None
         assert "cut off" in view.reason
         np.testing.assert_array_equal(view.T_world_frame, views[3].T_world_frame)
-        assert player.history.smoothed_path()[0].tolist() == stamps_ns()[:4] + stamps_ns()[5:]
+        assert player.history.path("smoothed")[0].tolist() == stamps_ns()[:4] + stamps_ns()[5:]
         player.restart(4)
         go(player, 6)
-        assert player.history.raw_path()[0].tolist() == stamps_ns()[5:7]
+        assert player.history.path("raw")[0].tolist() == stamps_ns()[5:7]
 
 
 def test_images_without_partner_are_no_frames() -> None:
@@ -314,7 +314,7 @@ def test_images_without_partner_are_no_frames() -> None:
     with Player(Recording(drop).open, Config()) as player:
         go(player, N_FRAMES)
         assert player.n_frames == N_FRAMES - 1
-        assert player.history.raw_path()[0].tolist() == stamps_ns()[:4] + stamps_ns()[5:]
+        assert player.history.path("raw")[0].tolist() == stamps_ns()[:4] + stamps_ns()[5:]
 
 
 def break_off(error: Exception) -> Change:
@@ -334,7 +334,7 @@ def test_a_recording_that_breaks_off_is_told_and_its_poses_are_there() -> None:
         assert player.fault == "the file ends here"
         assert player.is_finished
         assert not player.is_playing
-        assert player.history.smoothed_path()[0].tolist() == stamps_ns()[:6]
+        assert player.history.path("smoothed")[0].tolist() == stamps_ns()[:6]
         go(player, 1)
         assert player.index == 1
 
@@ -385,10 +385,10 @@ def test_an_excerpt_is_played_and_restarted_within() -> None:
     expected = [ns for ns in stamps_ns() if 0.1 <= 1e-9 * (ns - stamps_ns()[0]) < 0.35][::2]
     with Player(Recording().open, Config(), excerpt=excerpt) as player:
         go(player, 100)
-        assert player.history.raw_path()[0].tolist() == expected
+        assert player.history.path("raw")[0].tolist() == expected
         player.restart(2)
         go(player, 100)
-        assert player.history.raw_path()[0].tolist() == expected[2:]
+        assert player.history.path("raw")[0].tolist() == expected[2:]
 
 
 def test_what_was_done_can_be_read_after_the_end() -> None:
