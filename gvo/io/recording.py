@@ -116,3 +116,22 @@ class Source(Protocol):
 
     def ground_truth(self) -> Trajectory | None:
         """Return T_world_cam of stream 0's rectified camera, where the recording holds it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ChosenImages:
+    """Some images of a recording, or changed ones, as a recording without ground truth.
+
+    Parameters
+    ----------
+    info : RecordingInfo
+    images : callable
+        Yields them in the order of the recording.
+    """
+
+    info: RecordingInfo
+    images: Callable[[], Iterator[StampedImage]]
+
+    def ground_truth(self) -> Trajectory | None:
+        """Return nothing."""
+        return None

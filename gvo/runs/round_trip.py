@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,12 @@ from gvo.errors import RecordingError
 from gvo.io.excerpt import Excerpt
 from gvo.io.frames import frames, pair_limit_key
 from gvo.io.poses.base_frame import BaseFrame
-from gvo.io.recording import RecordingInfo, Source, StampedImage
+from gvo.io.recording import ChosenImages, Source, StampedImage
 from gvo.io.run_folder.writer import ROUND_TRIP_PICTURE, TRAJECTORIES, RunFolder, written_alone
 from gvo.runs.loop import RunLoop
 from gvo.runs.summary import RunningSummary, summarize
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.round_trip import RoundTripError, round_trip_error
-from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FaultyFrame, Frame, Progress, StereoFrame
 from gvo.viz.plots import plot_round_trip
 
@@ -114,7 +114,8 @@ class RoundTripFrames:
         key = pair_limit_key(self._source.info.sensor)
         margin_ns = round(float(getattr(self._config.sync, key)) * 1e6)
         least_ns, greatest_ns = piece.stamps_ns
-        source = _Windowed(self._source, (least_ns - margin_ns, greatest_ns + margin_ns))
+        images = partial(_loadable, self._source, least_ns - margin_ns, greatest_ns + margin_ns)
+        source = ChosenImages(info=self._source.info, images=images)
         return list(islice(frames(source, self._config, self._excerpt), piece.first, piece.end))
 
 
@@ -154,27 +155,11 @@ class _Log:
             self.n_to_turn = piece.end
 
 
-class _Windowed:
-    """A recording whose images can be loaded between two stamps only: so they cost nothing."""
-
-    def __init__(self, source: Source, window_ns: tuple[int, int]) -> None:
-        self._source, self._window_ns = source, window_ns
-
-    @property
-    def info(self) -> RecordingInfo:
-        """What is known before the first image."""
-        return self._source.info
-
-    def images(self) -> Iterator[StampedImage]:
-        """Yield all images; those outside of the window are faulty."""
-        first_ns, last_ns = self._window_ns
-        for image in self._source.images():
-            is_in = first_ns <= image.stamp_ns <= last_ns
-            yield image if is_in else replace(image, load=_not_loaded)
-
-    def ground_truth(self) -> Trajectory | None:
-        """Return what the recording holds."""
-        return self._source.ground_truth()
+def _loadable(source: Source, first_ns: int, last_ns: int) -> Iterator[StampedImage]:
+    """Yield all images; those outside of two stamps cannot be loaded: so they cost nothing."""
+    for image in source.images():
+        is_in = first_ns <= image.stamp_ns <= last_ns
+        yield image if is_in else replace(image, load=_not_loaded)
 
 
 def _not_loaded() -> NDArray[Any]:

@@ -187,7 +187,7 @@ def measured(
 
 
 def judged(
-    name: str, value: str, *, is_ok: bool, threshold: str, otherwise: Verdict, fix: str
+    name: str, value: str, *, is_ok: bool, threshold: str, fix: str, otherwise: Verdict = "warning"
 ) -> Finding:
     """Return a finding that is ok or not.
 
@@ -197,10 +197,10 @@ def judged(
         As of `Finding`.
     is_ok : bool
         Whether the verdict is "ok".
-    otherwise : {"warning", "fault"}
-        The verdict otherwise.
     fix : str
         What to do otherwise.
+    otherwise : {"warning", "fault"}
+        The verdict otherwise.
     """
     return Finding(
         name=name,

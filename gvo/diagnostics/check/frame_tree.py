@@ -72,7 +72,6 @@ def _check_trees(n_frames: int, roots: Collection[str]) -> Finding:
         f" (root {', '.join(names[:_N_NAMED])}{more})",
         is_ok=len(names) <= 1,
         threshold="1 tree",
-        otherwise="warning",
         fix="a transform between the trees is missing: record /tf_static as well",
     )
 
@@ -89,7 +88,6 @@ def _check_base(buffer: TfBuffer, camera: str, base_frame: str) -> Finding:
         else " - ".join(chain),
         is_ok=not isinstance(chain, Failure),
         threshold=f"connected to {base_frame}",
-        otherwise="warning",
         fix="record /tf_static, or give the camera's pose on the robot in a file",
     )
 

@@ -100,7 +100,6 @@ def _check_changes(changes: str) -> Finding:
         changes or "0 messages differ from the first",
         is_ok=not changes,
         threshold="0",
-        otherwise="warning",
         fix=CAMERA_CHANGED,
     )
 

@@ -5,15 +5,16 @@ from __future__ import annotations
 from array import array
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain
 
 import numpy as np
 
 from gvo.config import Config, SyncConfig
 from gvo.errors import GvoError
 from gvo.io.frames import frames, paired
-from gvo.io.recording import RecordingInfo, Source, StampedImage
+from gvo.io.recording import ChosenImages, RecordingInfo, Source, StampedImage
 from gvo.io.sync import Pair
-from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame, Frame, IntArray
 
 # For images to look at, if none are close enough in time for odometry.
@@ -160,28 +161,18 @@ class _Pass:
             self.damage = str(error)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Chosen:
-    """The chosen pairs as a recording, so that they become frames as all others."""
-
-    info: RecordingInfo
-    pairs: list[Pair]
-
-    def images(self) -> Iterator[StampedImage]:
-        for index, (first, second) in enumerate(self.pairs):
-            # With stamps a second apart, the pairs stay as they are.
-            yield replace(first, stamp_ns=index * 1_000_000_000)
-            yield replace(second, stamp_ns=index * 1_000_000_000)
-
-    def ground_truth(self) -> Trajectory | None:
-        return None
+def _images_of(chosen: list[list[Pair]]) -> Iterator[StampedImage]:
+    for index, pair in enumerate(chain.from_iterable(chosen)):
+        # With stamps a second apart, the pairs stay as they are.
+        yield from (replace(image, stamp_ns=index * 1_000_000_000) for image in pair)
 
 
 def _load(info: RecordingInfo, config: Config, chosen: list[list[Pair]]) -> tuple[Sample, ...]:
     # Frozen images are found by a check of their own, which needs them.
     sync = config.sync.model_copy(update={"repeated_images": "keep"})
     config = config.model_copy(update={"sync": sync})
-    loaded = frames(_Chosen(info=info, pairs=[pair for run in chosen for pair in run]), config)
+    # As a recording, so that they become frames as all others.
+    loaded = frames(ChosenImages(info=info, images=partial(_images_of, chosen)), config)
     return tuple(
         Sample(
             first=next(loaded),

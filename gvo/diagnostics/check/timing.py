@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from functools import partial
 from itertools import groupby, takewhile
 
 import numpy as np
@@ -16,9 +16,8 @@ from gvo.errors import GvoError
 from gvo.frontend.klt import image_of
 from gvo.frontend.tracking import detect_corners, track_pixels
 from gvo.io.frames import frames, pair_limit_key
-from gvo.io.recording import RecordingInfo, Source, StampedImage
+from gvo.io.recording import ChosenImages, RecordingInfo, Source, StampedImage
 from gvo.odometry.odometry import Odometry
-from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame, FloatArray, Frame, IntArray
 
 # Length of a gap, periods; shorter intervals are jitter.
@@ -309,29 +308,16 @@ def _flow_px(sample: Sample, config: Config) -> float:
     return float(np.median(lengths)) if len(lengths) >= config.ransac.min_inliers else 0.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Parts:
-    """Some parts of a recording, as a recording."""
+def _part_of(stamp_ns: int, parts: Sequence[tuple[int, int]]) -> int | None:
+    return next((n for n, (start, end) in enumerate(parts) if start <= stamp_ns <= end), None)
 
-    source: Source
-    parts: Sequence[tuple[int, int]]
 
-    @property
-    def info(self) -> RecordingInfo:
-        return self.source.info
-
-    def images(self) -> Iterator[StampedImage]:
-        last_ns = self.parts[-1][1] + _DELAY_NS
-        for image in takewhile(lambda image: image.stamp_ns < last_ns, self.source.images()):
-            if self.part_of(image.stamp_ns) is not None:
-                yield image
-
-    def part_of(self, stamp_ns: int) -> int | None:
-        within = [n for n, (start, end) in enumerate(self.parts) if start <= stamp_ns <= end]
-        return within[0] if within else None
-
-    def ground_truth(self) -> Trajectory | None:
-        return None
+def _images_of(source: Source, parts: Sequence[tuple[int, int]]) -> Iterator[StampedImage]:
+    """Yield the images of some parts of a recording."""
+    last_ns = parts[-1][1] + _DELAY_NS
+    for image in takewhile(lambda image: image.stamp_ns < last_ns, source.images()):
+        if _part_of(image.stamp_ns, parts) is not None:
+            yield image
 
 
 def _read(
@@ -339,9 +325,9 @@ def _read(
 ) -> Iterator[Iterator[Frame]]:
     """Yield the frames of each part."""
     if parts:
-        chosen = _Parts(source=source, parts=parts)
+        chosen = ChosenImages(info=source.info, images=partial(_images_of, source, parts))
         usable = _usable(chosen, config)
-        for _, part in groupby(usable, key=lambda frame: chosen.part_of(frame.stamp_ns)):
+        for _, part in groupby(usable, key=lambda frame: _part_of(frame.stamp_ns, parts)):
             yield part
 
 
