@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final, TypeAlias
 
 import cv2
 import numpy as np
 
+from gvo.frontend.klt import image_of
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.types import (
     BoolArray,
@@ -221,9 +222,10 @@ def colour_bar(scale: DepthScale, width: int) -> ImageArray:
     columns = np.linspace(255, 0, right - left).round().astype(np.int64)
     bar[2 : 2 + _BAR_PX, left:right] = table()[columns]
     is_free_from = 0
-    for depth, level in zip(scale.ticks(), _shares(scale), strict=True):
+    for depth in scale.ticks():
         text = f"{depth:g}"
-        u = left + round(level * (right - left - 1))
+        share = np.log(depth / scale.near_m) / np.log(scale.far_m / scale.near_m)
+        u = left + round(share * (right - left - 1))
         start = u - text_width(text) // 2
         if start < is_free_from or start + text_width(text) > width:
             continue
@@ -231,11 +233,6 @@ def colour_bar(scale: DepthScale, width: int) -> ImageArray:
         is_free_from = write(bar, text, (start, FOOTER_PX - 4))[0] + _MARGIN_PX
     bar.setflags(write=False)
     return bar
-
-
-def _shares(scale: DepthScale) -> FloatArray:
-    depths = np.array(scale.ticks())
-    return np.asarray(np.log(depths / scale.near_m) / np.log(scale.far_m / scale.near_m))
 
 
 def in_groups(levels: ImageArray, n_groups: int = 32) -> Iterator[tuple[IntArray, Colour]]:
@@ -306,12 +303,12 @@ def compose_overlay(
     ValueError
         When the image size is not the camera's, or a stereo frame's camera has no baseline.
     """
-    image = frame.left if isinstance(frame, StereoFrame) else frame.image
-    if image.shape != (camera.height, camera.width):
-        raise ValueError(f"expected images of {camera.width}x{camera.height}, got {image.shape}")
+    shape = image_of(frame).shape
+    if shape != (camera.height, camera.width):
+        raise ValueError(f"expected images of {camera.width}x{camera.height}, got {shape}")
     layout = Layout.of(camera, max_width)
     canvas = layout.empty()
-    _draw_panels(canvas, layout, frame, result.registration or NOTHING, camera)
+    _draw_panels(canvas, layout, frame, placed_matches(result), camera)
     _write_header(canvas, layout, result, index=index, rate_hz=rate_hz)
     _write_footer(canvas, layout, camera, result.reason)
     return canvas
@@ -386,6 +383,14 @@ def draw_matches(
     return canvas
 
 
+def placed_matches(result: FrameResult) -> RelativePose:
+    """Return the registration of a frame with those matches that have points; none without it."""
+    found = result.registration or NOTHING
+    n = min(len(found.pixels_current), len(found.points_current))
+    names = "pixels_reference", "pixels_current", "points_current", "inliers"
+    return replace(found, **{name: getattr(found, name)[:n] for name in names})
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
     """Two panels of equal size, stacked or side by side, between a header and a footer.
@@ -452,14 +457,11 @@ def _draw_panels(
     canvas: ImageArray, layout: Layout, frame: Frame, found: RelativePose, camera: PinholeCamera
 ) -> None:
     first, second = layout.panels(canvas)
-    n_shown = min(len(found.pixels_current), len(found.points_current))
-    current = layout.scaled(found.pixels_current[:n_shown])
-    reference = layout.scaled(found.pixels_reference[:n_shown])
-    image = frame.left if isinstance(frame, StereoFrame) else frame.image
-    small = _resized(image, layout.panel)
-    first[:] = draw_matches(small, reference, current, found.inliers[:n_shown], lines=["flow"])
+    current, reference = map(layout.scaled, (found.pixels_current, found.pixels_reference))
+    small = _resized(image_of(frame), layout.panel)
+    first[:] = draw_matches(small, reference, current, found.inliers, lines=["flow"])
     if isinstance(frame, StereoFrame):
-        depths = found.points_current[:n_shown, 2]
+        depths = found.points_current[:, 2]
         second[:] = _disparity_picture(small, current, depths, camera, layout.scale)
     else:
         second[:] = _depth_picture(frame, current, camera, layout.panel)

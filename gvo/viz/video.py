@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 import cv2
 import numpy as np
@@ -34,19 +34,7 @@ _MATROSKA = b"\x42\x82\x88matroska"
 _WEBM = b"\x42\x82\x84webm\xec\x82\x00\x00"
 
 
-class PictureSink(Protocol):
-    """What pictures are written to."""
-
-    decisions: tuple[str, ...]
-
-    def add(self, picture: ImageArray, stamp_ns: int) -> None:
-        """Write one more picture, of the size of the first."""
-
-    def close(self) -> None:
-        """Finish what was written."""
-
-
-def open_sink(path: Path) -> PictureSink:
+def open_sink(path: Path) -> Film | PngFolder:
     """Open a film or a folder of pictures, by the name of the path.
 
     Parameters
@@ -125,7 +113,9 @@ class Film:
         RecordingError
             When the film cannot be written.
         """
-        picture = _even(picture)
+        height, width = picture.shape[:2]
+        # Encoders subsample colours by two: an odd last row or column is cut off.
+        picture = np.ascontiguousarray(picture[: height & ~1, : width & ~1])
         size = (picture.shape[1], picture.shape[0])
         if self._n > 0 and size != self._size:
             raise ValueError(f"expected a picture of {self._size}, got {size}")
@@ -263,12 +253,6 @@ def rate_of(stamps_ns: Sequence[int]) -> float:
     if len(periods_ns) == 0:
         return _FALLBACK_HZ
     return float(np.clip(1e9 / np.median(periods_ns), _SLOWEST_HZ, _FASTEST_HZ))
-
-
-def _even(picture: ImageArray) -> ImageArray:
-    """Cut off an odd last row or column: encoders subsample colours by two."""
-    height, width = picture.shape[:2]
-    return np.ascontiguousarray(picture[: height & ~1, : width & ~1])
 
 
 def _open_writer(

@@ -54,6 +54,7 @@ from rosbags.rosbag1 import WriterError as WriterError1
 from rosbags.rosbag2 import WriterError as WriterError2
 
 from gvo.errors import RecordingError
+from gvo.frontend.klt import image_of
 from gvo.geometry import se3
 from gvo.io.bag.reader import TF_TYPE
 from gvo.io.bag.topics import COMPRESSED_TYPE
@@ -89,9 +90,8 @@ from gvo.types import (
     Loop,
     Optimum,
     Status,
-    StereoFrame,
 )
-from gvo.viz.overlay import NOTHING, caption, draw_matches
+from gvo.viz.overlay import caption, draw_matches, placed_matches
 
 SUFFIXES: Final = (".mcap", ".bag")
 N_SHOWN_POSES: Final = 500
@@ -261,30 +261,14 @@ class RunMessages:
         text = " ".join(caption(result))
         write_diagnostics(self._writer, hardware, result.status, text, _numbers(result))
         header = Header(frame.stamp_ns, self._frames.camera_by("causal"))
+        image, found = image_of(frame), placed_matches(result)
         if self._writer.is_wanted(_POINTS):
-            self._write_points(frame, result, header)
+            intensities = _grey_values(image, found.pixels_current)
+            write_points(self._writer, _POINTS, header, found, intensities)
         if self._writer.is_wanted(_PICTURE):
-            self._write_picture(frame, result, header)
-
-    def _write_points(self, frame: Frame, result: FrameResult, header: Header) -> None:
-        found = result.registration or NOTHING
-        n_told = min(len(found.pixels_current), len(found.points_current))
-        write_points(
-            self._writer,
-            _POINTS,
-            header,
-            found.points_current[:n_told],
-            intensities=_grey_values(_image(frame), found.pixels_current[:n_told]),
-            inliers=found.inliers[:n_told],
-        )
-
-    def _write_picture(self, frame: Frame, result: FrameResult, header: Header) -> None:
-        found = result.registration or NOTHING
-        n_told = min(len(found.pixels_current), len(found.points_current))
-        matches = found.pixels_reference[:n_told], found.pixels_current[:n_told]
-        inliers = found.inliers[:n_told]
-        picture = draw_matches(_image(frame), *matches, inliers, lines=caption(result))
-        write_picture(self._writer, _PICTURE, header, picture)
+            matches = found.pixels_reference, found.pixels_current, found.inliers
+            picture = draw_matches(image, *matches, lines=caption(result))
+            write_picture(self._writer, _PICTURE, header, picture)
 
     def _write_paths_of_second(self, stamp_ns: int) -> None:
         """Write the paths where a new second of the recording has begun."""
@@ -369,10 +353,6 @@ class RunBag(AbstractContextManager["RunBag"]):
     def __exit__(self, *exception: object) -> None:
         """Close it."""
         self.close()
-
-
-def _image(frame: Frame) -> ImageArray:
-    return frame.left if isinstance(frame, StereoFrame) else frame.image
 
 
 def _grey_values(image: ImageArray, pixels: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ from gvo.geometry import se3
 from gvo.io.bag.topics import COMPRESSED_TYPE
 from gvo.io.convert.bag_messages import Header, MessageWriter, pose_numbers
 from gvo.runs.outputs.frames import Twist
-from gvo.types import BoolArray, Estimate, FloatArray, IntArray, Status
+from gvo.types import Estimate, FloatArray, IntArray, RelativePose, Status
 from gvo.viz.palette import ESTIMATES
 
 ODOMETRY_TYPE: Final = "nav_msgs/msg/Odometry"
@@ -187,15 +187,9 @@ def _untextured(writer: MessageWriter) -> dict[str, object]:
 
 
 def write_points(
-    writer: MessageWriter,
-    topic: str,
-    header: Header,
-    points: FloatArray,
-    *,
-    intensities: FloatArray,
-    inliers: BoolArray,
+    writer: MessageWriter, topic: str, header: Header, found: RelativePose, intensities: FloatArray
 ) -> None:
-    """Write points as an unorganised `sensor_msgs/PointCloud2`.
+    """Write matched points as an unorganised `sensor_msgs/PointCloud2`.
 
     Its fields are x, y, z and intensity (FLOAT32), and inlier (UINT8, 0 or 1); points that are
     not finite are left out.
@@ -207,16 +201,16 @@ def write_points(
         Where to.
     header : Header
         Stamp, and the frame of the points.
-    points : ndarray of float64, shape (n, 3)
-        Metres.
+    found : RelativePose
+        Its n points, and which are inliers.
     intensities : ndarray of float64, shape (n,)
-    inliers : ndarray of bool, shape (n,)
     """
+    points = found.points_current
     is_finite = np.isfinite(points).all(axis=1)
     cloud = np.zeros(int(np.count_nonzero(is_finite)), dtype=_POINT)
     for name, values in zip("xyz", points[is_finite].T, strict=True):
         cloud[name] = values
-    cloud["intensity"], cloud["inlier"] = intensities[is_finite], inliers[is_finite]
+    cloud["intensity"], cloud["inlier"] = intensities[is_finite], found.inliers[is_finite]
     message = writer.make(
         CLOUD_TYPE,
         header=writer.header(header),

@@ -16,6 +16,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from scipy.spatial.transform import Rotation
 
+from gvo.frontend.klt import image_of
 from gvo.geometry.camera import PinholeCamera
 from gvo.io.convert.bag_messages import pose_numbers
 from gvo.io.images import encode_image
@@ -30,10 +31,9 @@ from gvo.types import (
     Optimum,
     RelativePose,
     Status,
-    StereoFrame,
 )
 from gvo.viz import palette
-from gvo.viz.overlay import NOTHING, caption, compose_overlay
+from gvo.viz.overlay import NOTHING, caption, compose_overlay, placed_matches
 
 _N_BYTES: Final = 2**20
 
@@ -292,7 +292,7 @@ class RerunWriter:
 
     def add_frame(self, frame: Frame, result: FrameResult) -> None:
         """Log the result of a frame."""
-        image = frame.left if isinstance(frame, StereoFrame) else frame.image
+        image = image_of(frame)
         self._begin(result)
         self._stamps_ns.append(frame.stamp_ns)
         self._indices.append(self._n_seen)
@@ -378,7 +378,7 @@ class RerunWriter:
         self.stream.log(f"{_CAMERA}/points", make_matches(found))
         if result.stamp_ns in result.keyframes_ns and len(found.points_current) > 0:
             T_world_cam = result.causal.T_world_frame @ self._frames.mount(result.stamp_ns)
-            self.stream.log(CLOUD, make_cloud(found, image, T_world_cam))
+            self.stream.log(CLOUD, make_cloud(placed_matches(result), image, T_world_cam))
 
     def _add_links(self, result: FrameResult) -> None:
         """Log the window's keyframes and the edges that came with the frame."""
@@ -558,19 +558,19 @@ def make_cloud(found: RelativePose, image: ImageArray, T_world_cam: FloatArray) 
     Parameters
     ----------
     found : RelativePose
+        See `placed_matches`.
     image : ndarray of uint8, shape (height, width)
         The current one.
     T_world_cam : ndarray of float64, shape (4, 4)
         Maps camera coordinates to the world, metres.
     """
     points, pixels = found.points_current, found.pixels_current
-    n = min(len(points), len(pixels))
-    is_shown = found.inliers[:n] & np.isfinite(points[:n]).all(axis=1)
-    is_shown &= np.isfinite(pixels[:n]).all(axis=1)
+    is_finite = np.isfinite(np.column_stack([points, pixels])).all(axis=1)
+    is_shown = found.inliers & is_finite
     height, width = image.shape
-    u, v = np.rint(pixels[:n][is_shown]).astype(np.int64).T
+    u, v = np.rint(pixels[is_shown]).astype(np.int64).T
     greys = image[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)]
-    points_world = points[:n][is_shown] @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
+    points_world = points[is_shown] @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
     return _points(points_world, np.repeat(greys[:, np.newaxis], 3, axis=1))
 
 

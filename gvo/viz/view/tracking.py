@@ -13,12 +13,13 @@ import numpy as np
 
 from gvo.backend.window import SlidingWindow
 from gvo.config import Config, DepthConfig
+from gvo.frontend.klt import image_of
 from gvo.geometry.camera import PinholeCamera
 from gvo.io.excerpt import Excerpt
 from gvo.io.frames import frames, paired
 from gvo.io.recording import Source
 from gvo.odometry.odometry import Odometry
-from gvo.types import Estimate, FaultyFrame, Frame, FrameResult, ImageArray, StereoFrame
+from gvo.types import Estimate, FaultyFrame, Frame, FrameResult, ImageArray
 from gvo.viz.overlay import compose_overlay, draw_matches
 from gvo.viz.view.clouds import empty_cloud, frame_cloud
 from gvo.viz.view.history import FrameRecord
@@ -207,7 +208,7 @@ class FrameRecorder:
             cloud = empty_cloud()
         else:
             reason = result.reason
-            image = frame.left if isinstance(frame, StereoFrame) else frame.image
+            image = image_of(frame)
             rate_hz = self._rate_hz(result)
             overlay = compose_overlay(frame, result, self._camera, index=index, rate_hz=rate_hz)
             cloud = frame_cloud(frame, result.registration, self._camera, depth)
