@@ -105,10 +105,11 @@ def _figure_of_errors(
     for each, style in zip(compared, styles, strict=True):
         label = f"{plain(each.name)} (ATE {each.ate_m:.3g} m)"
         _draw_path(view, each.trajectory, plane, style, label)
-        _draw_values(errors, _elapsed(each.reference.stamps_ns, shown), each.errors_m, style)
+        elapsed_s = elapsed(each.reference.stamps_ns, int(shown.stamps_ns[0]))
+        _draw_values(errors, elapsed_s, each.errors_m, style)
     _mark_start(view, shown, plane)
-    errors.set(xlabel=_stamp_label(shown), ylabel=f"position error [m], alignment: {align}")
-    errors.set_ylim(bottom=0.0)
+    words = f"position error [m], alignment: {align}"
+    errors.set(xlabel=_stamp_label(shown), ylabel=words, ylim=(0.0, None))
     errors.grid(alpha=0.3)
     _place_legend(figure, view)
     return figure
@@ -121,9 +122,9 @@ def _figure_of_positions(estimates: Mapping[str, Trajectory], styles: Sequence[S
     view, panels = axes["view"], [axes[axis] for axis in "xyz"]
     for (name, estimate), style in zip(estimates.items(), styles, strict=True):
         _draw_path(view, estimate, (0, 2), style, plain(name))
-        elapsed = _elapsed(estimate.stamps_ns, start)
+        elapsed_s = elapsed(estimate.stamps_ns, int(start.stamps_ns[0]))
         for axis, panel in enumerate(panels):
-            _draw_values(panel, elapsed, estimate.positions[:, axis], style)
+            _draw_values(panel, elapsed_s, estimate.positions[:, axis], style)
     _mark_start(view, start, (0, 2))
     for letter, panel in zip("xyz", panels, strict=True):
         panel.set_ylabel(f"{letter} [m]")
@@ -187,8 +188,8 @@ def _draw_round_trip(errors: Mapping[str, RoundTripError]) -> Figure:
 
 def _draw_ways(view: Axes, error: RoundTripError, colour: str) -> None:
     for trajectory, linestyle in ((error.forward, "-"), (error.backward, "--")):
-        shown = _decimated(trajectory.positions[:, [0, 2]])
-        view.plot(*shown.T, color=colour, linestyle=linestyle, linewidth=1.2)
+        shown = trajectory.positions[evenly(len(trajectory), _MAX_POINTS)]
+        view.plot(shown[:, 0], shown[:, 2], color=colour, linestyle=linestyle, linewidth=1.2)
 
 
 def _draw_gap(end: Axes, error: RoundTripError, colour: str, name: str) -> None:
@@ -204,8 +205,9 @@ def _draw_gap(end: Axes, error: RoundTripError, colour: str, name: str) -> None:
 
 def _draw_errors(panel: Axes, error: RoundTripError, values: FloatArray, colour: str) -> None:
     stamps_ns = error.forward.stamps_ns
-    to_turn_s = (stamps_ns - stamps_ns[-1]) / 1e9
-    panel.plot(*_decimated(np.column_stack([to_turn_s, values])).T, color=colour, linewidth=1.2)
+    rows = evenly(len(stamps_ns), _MAX_POINTS)
+    to_turn_s = (stamps_ns[rows] - stamps_ns[-1]) / 1e9
+    panel.plot(to_turn_s, values[rows], color=colour, linewidth=1.2)
 
 
 def _finish_round_trip_view(view: Axes, error: RoundTripError) -> None:
@@ -247,11 +249,9 @@ def _finish_errors(metres: Axes, degrees: Axes) -> None:
         panel.grid(alpha=0.3)
 
 
-def _decimated(points: FloatArray) -> FloatArray:
-    """Return at most `_MAX_POINTS` rows, including the first and the last."""
-    if len(points) <= _MAX_POINTS:
-        return points
-    return points[np.linspace(0, len(points) - 1, _MAX_POINTS).round().astype(np.int64)]
+def evenly(n: int, n_most: int) -> IntArray:
+    """Return indices of n items, at most so many: spread evenly, first and last among them."""
+    return np.linspace(0, n - 1, min(n, n_most)).round().astype(np.int64)
 
 
 def save_figure(figure: Figure, path: Path) -> None:
@@ -303,8 +303,9 @@ def _set_view(view: Axes, plane: tuple[int, int]) -> None:
     view.grid(alpha=0.3)
 
 
-def _elapsed(stamps_ns: IntArray, start: Trajectory) -> FloatArray:
-    return np.asarray((stamps_ns - start.stamps_ns[0]) / 1e9)
+def elapsed(stamps_ns: IntArray, first_ns: int) -> FloatArray:
+    """Return seconds since a stamp."""
+    return np.asarray((stamps_ns - first_ns) / 1e9, dtype=np.float64)
 
 
 def _stamp_label(trajectory: Trajectory) -> str:

@@ -18,6 +18,7 @@ from gvo.batch.effects import COUNTS, ERROR, MIN_RUNS, TIME, relative, span, val
 from gvo.batch.report.values import N_LABEL, Batch, logarithmic_axis, shown, value_text
 from gvo.types import BoolArray, FloatArray
 from gvo.viz.palette import ESTIMATES, REFUSED
+from gvo.viz.plots import evenly
 from gvo.viz.report.page import table_html
 from gvo.viz.report.sheets import WIDE, Plot, arrange
 
@@ -218,7 +219,8 @@ def _draw_row(axes: Axes, y: float, panel: _Panel, row: _Row) -> None:
         axes.fill_betweenx([y - 0.3, y + 0.3], left, right, color=colour, alpha=0.35, lw=0)
         axes.plot([middle, middle], [y - 0.3, y + 0.3], color="black", lw=1.4, zorder=4.0)
         if len(values) > _MAX_POINTS:
-            points = _thinned(values[(values < low) | (values > high)])
+            beyond = np.sort(values[(values < low) | (values > high)])
+            points = beyond[evenly(len(beyond), _MAX_POINTS)]
     looks: dict[str, Any] = {"ls": "", "marker": "o", "ms": 3.2, "zorder": 3.0}
     axes.plot(points, np.full(len(points), y), color=colour, mec="none", **looks)
     looks |= {"mfc": "white", "mew": 0.9, "zorder": 5.0}
@@ -236,13 +238,6 @@ def box_of(values: FloatArray, *, is_logarithmic: bool) -> FloatArray:
     [box] = boxplot_stats(np.log(values) if is_logarithmic else values, whis=_WHISKER)
     five = np.array([box[name] for name in ("whislo", "q1", "med", "q3", "whishi")])
     return np.exp(five) if is_logarithmic else five
-
-
-def _thinned(values: FloatArray) -> FloatArray:
-    """Return at most `_MAX_POINTS` values, the smallest and the largest among them."""
-    if len(values) <= _MAX_POINTS:
-        return values
-    return np.sort(values)[np.linspace(0, len(values) - 1, _MAX_POINTS).round().astype(np.int64)]
 
 
 def _finish(axes: Axes, panel: _Panel, rows: Sequence[_Row]) -> None:

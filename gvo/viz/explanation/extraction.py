@@ -92,8 +92,7 @@ def _draw_cells(
     title = "kept / detected in each cell" if has_numbers else "kept in each cell (darker: more)"
     vmax = max(2 * int(kept.max()), 1)
     show_image(axes, kept, title, cmap="Blues", vmax=vmax, extent=edges)
-    axes.set_xlim(-0.5, width - 0.5)
-    axes.set_ylim(height - 0.5, -0.5)
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
     axes.set_xticks(np.arange(size, columns * size, size) - 0.5, labels=[])
     axes.set_yticks(np.arange(size, rows * size, size) - 0.5, labels=[])
     axes.tick_params(length=0)

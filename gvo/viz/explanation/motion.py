@@ -124,8 +124,7 @@ def _draw_crops(panels: Sequence[Axes], explanation: FrameExplanation, matches: 
         _draw_search(axes, (u, v), found, begin)
         away = 1.2 * float(np.abs(found - (u, v)).max()) + 6.0
         reach = max(2.2 * begin["radius_px"], 18.0, away)
-        axes.set_xlim(u - reach, u + reach)
-        axes.set_ylim(v + reach, v - reach)
+        axes.set(xlim=(u - reach, u + reach), ylim=(v + reach, v - reach))
         axes.set_title(f"{errors[index]:.1f} px off", fontsize=10)
     for axes in panels[len(chosen) :]:
         axes.set_axis_off()
@@ -223,8 +222,7 @@ def _draw_samples(axes: Axes, step: Step) -> None:
             label = f"stopped after {len(counts)}"
             axes.axvline(len(counts), color=LIMIT, linestyle="--", label=label)
     axes.axhline(n_matches, color="black", linestyle=":", label=f"all {n_matches} matches")
-    axes.set_xlim(0, max(n_planned, 1) * 1.02)
-    axes.set_ylim(0, 1.25 * max(n_matches, 1))
+    axes.set(xlim=(0, max(n_planned, 1) * 1.02), ylim=(0, 1.25 * max(n_matches, 1)))
     title = f"what the samples {'would have ' if step.is_known else ''}found"
     finish_axes(axes, "sample", "inliers", title, loc="upper right", ncols=4)
 
@@ -252,8 +250,7 @@ def draw_residuals(explanation: FrameExplanation) -> Picture:
     _draw_after(cloud, u, v, step)
     circle = gate * np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 100))
     cloud.plot(circle.real, circle.imag, "--", color=LIMIT, linewidth=1.0, label="gate")
-    cloud.set_aspect("equal")
-    cloud.set_xlim(-2.1 * gate, 2.1 * gate)
+    cloud.set(aspect="equal", xlim=(-2.1 * gate, 2.1 * gate))
     place: dict[str, Any] = {"loc": "upper center", "columnspacing": 0.8, "handletextpad": 0.2}
     labels = "after, whitened u [sigma], at the border: beyond", "whitened v [sigma]"
     finish_axes(cloud, *labels, ncols=3, **place)
@@ -355,10 +352,9 @@ def _draw_ellipses(axes: Axes, covariance: FloatArray, names: tuple[str, str], t
         axes.plot(*(sigma * rim), style, color=AFTER, label=f"{sigma} sigma")
     axes.plot(0.0, 0.0, "+", color="black", markersize=10)
     reach = 1.15 * max(3.0 * float(np.sqrt(np.maximum(np.diag(covariance), 0.0)).max()), 1e-3)
-    axes.set_aspect("equal")
-    axes.set_xlim(-reach, reach)
     # Room for the legend above; y points down.
-    axes.set_ylim(*((-reach, 1.3 * reach) if names[1] == "z" else (-1.3 * reach, reach)))
+    y_limits = (-reach, 1.3 * reach) if names[1] == "z" else (-1.3 * reach, reach)
+    axes.set(aspect="equal", xlim=(-reach, reach), ylim=y_limits)
     place: dict[str, Any] = {"loc": "upper center", "ncols": 3, "columnspacing": 0.8}
     x_label, y_label = (f"{name} - estimate [mm]" for name in names)
     finish_axes(axes, x_label, y_label, title, **place)

@@ -171,10 +171,8 @@ def paired_height(shape: Sequence[int]) -> float:
 def show_image(axes: Axes, image: Any, title: str = "", **options: Any) -> None:  # noqa: ANN401
     """Show an image, grey by default, without ticks."""
     axes.imshow(image, **{"cmap": "gray", "vmin": 0, "vmax": 255, **options})
-    axes.set_xlim(-0.5, image.shape[1] - 0.5)
-    axes.set_ylim(image.shape[0] - 0.5, -0.5)
-    axes.set_xticks([])
-    axes.set_yticks([])
+    height, width = image.shape[:2]
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
     axes.set_title(title, fontsize=_FONT_SIZE, loc="left")
 
 

@@ -114,13 +114,9 @@ def table_html(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def _row(tag: str, texts: Sequence[str]) -> str:
-    cells = "".join(_cell(tag, text, is_name=n == 0) for n, text in enumerate(texts))
-    return f"<tr>{cells}</tr>"
-
-
-def _cell(tag: str, text: str, *, is_name: bool) -> str:
-    kind = "" if is_name else ' class="number"'
-    return f"<{tag}{kind}>{html_text(text)}</{tag}>"
+    name, *numbers = map(html_text, texts)
+    cells = "".join(f'<{tag} class="number">{number}</{tag}>' for number in numbers)
+    return f"<tr><{tag}>{name}</{tag}>{cells}</tr>"
 
 
 def facts_html(facts: Mapping[str, str]) -> str:

@@ -93,7 +93,7 @@ def loop_lines(ends: Mapping[str, FloatArray]) -> list[Line]:
 def path_plots(lines: Sequence[Line], world: World) -> list[Plot]:
     """Return the views from above, from the side and in space."""
     scale = "Both axes have one scale; the circle is the start."
-    views = _Views.of(lines)
+    near, labels = _near_origin(lines)
     points = np.concatenate([line.points for line in lines])
     extents = np.nanmax(points, axis=0) - np.nanmin(points, axis=0)
     along = max(world.ground, key=lambda axis: extents[axis])
@@ -101,19 +101,19 @@ def path_plots(lines: Sequence[Line], world: World) -> list[Plot]:
         Plot(
             slug="above",
             text=f"{world.words} {scale} {_good_words(lines)}",
-            figure=_view(views, world.ground, is_flipped=False),
+            figure=_view(near, labels, world.ground, is_flipped=False),
             is_half=True,
         ),
         Plot(
             slug="side",
             text=f"{scale} Odometry drifts in height first: look for a slow climb or descent.",
-            figure=_view(views, (along, world.up), is_flipped=world.is_up_negative),
+            figure=_view(near, labels, (along, world.up), is_flipped=world.is_up_negative),
             is_half=True,
         ),
         Plot(
             slug="space",
             text="The same paths; all three axes have one scale.",
-            figure=_space(views, world),
+            figure=_space(near, labels, world),
         ),
     ]
 
@@ -127,22 +127,12 @@ def _good_words(lines: Sequence[Line]) -> str:
     return words
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Views:
-    """Lines shifted to the origin of the axes, and the labels of the axes."""
-
-    lines: Sequence[Line]
-    labels: Sequence[str]
-
-    @classmethod
-    def of(cls, lines: Sequence[Line]) -> _Views:
-        """Shift coordinates of a map grid: the axes have no room for them."""
-        low = np.nanmin(np.concatenate([line.points for line in lines]), axis=0)
-        origin = np.where(np.abs(low) >= _MAX_SHOWN_M, np.round(low, -3), 0.0)
-        return cls(
-            lines=[replace(line, points=line.points - origin) for line in lines],
-            labels=[_label(axis, shift) for axis, shift in zip("xyz", origin, strict=True)],
-        )
+def _near_origin(lines: Sequence[Line]) -> tuple[list[Line], list[str]]:
+    """Shift coordinates of a map grid, for which axes have no room; also label the axes."""
+    low = np.nanmin(np.concatenate([line.points for line in lines]), axis=0)
+    origin = np.where(np.abs(low) >= _MAX_SHOWN_M, np.round(low, -3), 0.0)
+    labels = [_label(axis, shift) for axis, shift in zip("xyz", origin, strict=True)]
+    return [replace(line, points=line.points - origin) for line in lines], labels
 
 
 def _label(axis: str, origin: float) -> str:
@@ -151,11 +141,13 @@ def _label(axis: str, origin: float) -> str:
     return f"{axis} {'-' if origin > 0 else '+'} {abs(origin):.0f} [m]"
 
 
-def _view(views: _Views, plane: tuple[int, int], *, is_flipped: bool) -> Figure:
+def _view(
+    lines: Sequence[Line], labels: Sequence[str], plane: tuple[int, int], *, is_flipped: bool
+) -> Figure:
     figure = Figure(figsize=(HALF, _HEIGHT))
     axes = figure.subplots()
-    _draw_lines(axes, views.lines, plane)
-    axes.set(xlabel=views.labels[plane[0]], ylabel=views.labels[plane[1]])
+    _draw_lines(axes, lines, plane)
+    axes.set(xlabel=labels[plane[0]], ylabel=labels[plane[1]])
     arrange(figure, axes)
     _set_equal(axes, figure.get_size_inches() * axes.get_position().size)
     if is_flipped:
@@ -180,14 +172,14 @@ def _set_equal(axes: Axes, size: FloatArray) -> None:
     axes.set_aspect("equal", adjustable="box")
 
 
-def _space(views: _Views, world: World) -> Figure:
+def _space(lines: Sequence[Line], labels: Sequence[str], world: World) -> Figure:
     figure = Figure(figsize=(HALF * 1.2, HALF))
     axes: Any = figure.add_subplot(projection="3d")
     order = (*world.ground, world.up)
-    _draw_lines(axes, views.lines, order)
-    _set_box(axes, np.concatenate([line.points for line in views.lines])[:, order])
-    names = [views.labels[axis] for axis in order]
-    axes.set(xlabel=names[0], ylabel=names[1], zlabel=names[2])
+    _draw_lines(axes, lines, order)
+    _set_box(axes, np.concatenate([line.points for line in lines])[:, order])
+    right, ahead, up = (labels[axis] for axis in order)
+    axes.set(xlabel=right, ylabel=ahead, zlabel=up)
     axes.locator_params(nbins=5)
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.labelpad = _SPACE_LABEL_PAD

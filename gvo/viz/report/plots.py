@@ -8,6 +8,7 @@ from itertools import cycle
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from gvo.io.run_folder.reader import EdgeTable, FrameTable, TimingTable
@@ -32,7 +33,7 @@ from gvo.viz.palette import (
     Style,
     styles_of,
 )
-from gvo.viz.plots import plain
+from gvo.viz.plots import elapsed, plain
 from gvo.viz.report.sheets import (
     N_COLUMNS,
     WIDE,
@@ -40,7 +41,6 @@ from gvo.viz.report.sheets import (
     arrange,
     columns_of,
     draw_curve,
-    elapsed,
     fit_left,
     kept_of_curve,
     kept_of_dots,
@@ -172,21 +172,21 @@ def _drift_figure(found: Sequence[tuple[str, Drift | None]]) -> Figure:
     styles = styles_of(name for name, _ in found)
     for (name, item), style, marker in zip(found, styles, cycle("osD^vP*X"), strict=False):
         if item is not None:
-            _draw_drift(panels, name, item, style, marker=marker)
+            looks = {
+                "color": style.color,
+                "linestyle": style.linestyle,
+                "marker": marker,
+                "ms": 4.5,
+            }
+            panels[0].plot(item.lengths_m, item.translations_pct, label=plain(name), **looks)
+            panels[1].plot(item.lengths_m, item.rotations_deg_per_m, **looks)
     panels[0].set(xlabel="length of segment [m]", ylabel="translation error [%]")
     panels[1].set(xlabel="length of segment [m]", ylabel="rotation error [deg/m]")
     for axes in panels:
-        axes.set_ylim(0.0, 1.1 * axes.dataLim.y1 or 1.0)
-        axes.set_xlim(left=0.0)
+        axes.set(xlim=(0.0, None), ylim=(0.0, 1.1 * axes.dataLim.y1 or 1.0))
     arrange(figure, panels[0])
     figure.subplots_adjust(wspace=0.2)
     return figure
-
-
-def _draw_drift(panels: Any, name: str, item: Drift, style: Style, *, marker: str) -> None:  # noqa: ANN401
-    looks = {"color": style.color, "linestyle": style.linestyle, "marker": marker, "ms": 4.5}
-    panels[0].plot(item.lengths_m, item.translations_pct, label=plain(name), **looks)
-    panels[1].plot(item.lengths_m, item.rotations_deg_per_m, **looks)
 
 
 def covariance_plot(item: Consistency, first_ns: int) -> Plot:
@@ -333,36 +333,31 @@ def timing_plot(timings: TimingTable | None) -> Plot:
     table = np.nan_to_num(np.stack(list(timings.stages_ms.values())))
     total = table.sum(axis=0)
     median, slow = np.quantile(total, [0.5, 0.95])
+    figure, axes = time_axes(3.2, "milliseconds per frame [ms]")
+    _stack(axes, timings, table)
+    axes.axhline(median, color="black", lw=1.0, label=f"median {median:.1f}")
+    axes.axhline(slow, color="black", lw=1.0, ls=":", label=f"95 %: {slow:.1f}")
+    axes.set_ylim(0.0, 1.05 * float(total.max()) or 1.0)
+    arrange(figure, axes)
     return Plot(
         slug="timings",
         text="Wall time of each frame, stacked by stage, with the medians in brackets. The median "
         f"frame took {median:.1f} ms, 95 % took less than {slow:.1f} ms, the slowest "
         f"{total.max():.1f} ms. {_rate_words(timings, total)}",
-        figure=_stack(timings, table),
+        figure=figure,
     )
 
 
-def _stack(timings: TimingTable, table: FloatArray) -> Figure:
-    total = table.sum(axis=0)
-    median, slow = np.quantile(total, [0.5, 0.95])
+def _stack(axes: Axes, timings: TimingTable, table: FloatArray) -> None:
     x = elapsed(timings.stamps_ns, int(timings.stamps_ns[0]))
-    kept = kept_of_curve(x, total, n_columns=N_COLUMNS // 2)
-    is_one = len(x) == 1  # a stack of one frame has no width
-    at, drawn = (
-        (np.array([-0.5, 0.5]), np.repeat(table, 2, axis=1))
-        if is_one
-        else (x[kept], table[:, kept])
-    )
+    kept = kept_of_curve(x, table.sum(axis=0), n_columns=N_COLUMNS // 2)
+    at, drawn = x[kept], table[:, kept]
+    if len(x) == 1:  # a stack of one frame has no width
+        at, drawn = np.array([-0.5, 0.5]), np.repeat(table, 2, axis=1)
     stages = timings.stages_ms
     labels = [f"{name} ({np.median(row):.1f})" for name, row in zip(stages, table, strict=True)]
     colours = [STAGES.get(name, _UNKNOWN) for name in stages]
-    figure, axes = time_axes(3.2, "milliseconds per frame [ms]")
     axes.stackplot(at, drawn, labels=labels, colors=colours, step="mid", lw=0)
-    axes.axhline(median, color="black", lw=1.0, label=f"median {median:.1f}")
-    axes.axhline(slow, color="black", lw=1.0, ls=":", label=f"95 %: {slow:.1f}")
-    axes.set_ylim(0.0, 1.05 * float(total.max()) or 1.0)
-    arrange(figure, axes)
-    return figure
 
 
 def _rate_words(timings: TimingTable, total: FloatArray) -> str:
@@ -467,9 +462,8 @@ def _histogram(edges: EdgeTable, bound: float) -> Figure:
     axes.axvline(np.log10(bound), color="black", ls=":", label=f"95 % bound: {bound:.1f}")
     decades = range(int(_DECADES[0]), int(_DECADES[1]) + 1)
     axes.set_xticks(list(decades), [f"{10.0**decade:g}" for decade in decades])
-    axes.set_xlim(*_DECADES)
-    axes.set_ylim(bottom=0.0)
     axes.set(xlabel="chi-square [-]", ylabel="density per decade [-]")
+    axes.set(xlim=_DECADES, ylim=(0.0, None))
     arrange(figure, axes)
     return figure
 

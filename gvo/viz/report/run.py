@@ -17,6 +17,7 @@ from gvo.trajectory.alignment import AlignMode
 from gvo.trajectory.evaluation import Evaluation, consistency, evaluation_table, motions_of_chain
 from gvo.trajectory.trajectory import Trajectory
 from gvo.viz.measures import Comparison, compare
+from gvo.viz.plots import elapsed, evenly
 from gvo.viz.report.page import (
     configuration_html,
     facts_html,
@@ -35,7 +36,7 @@ from gvo.viz.report.plots import (
     status_plot,
     timing_plot,
 )
-from gvo.viz.report.sheets import Plot, elapsed, settings, write_plots
+from gvo.viz.report.sheets import Plot, settings, write_plots
 
 _TRUTH_PLOTS = ("errors_over_time", "errors_over_distance", "drift", "covariance")
 _LOOP_COLUMNS = ("at [s]", "place of [s]", "inliers", "residual", "why refused")
@@ -277,7 +278,7 @@ def _loops(loops: LoopTable | None, first_ns: int) -> list[str]:
     if loops is None or not loops.reasons:
         return []
     n = len(loops.reasons)
-    chosen = np.unique(np.linspace(0, n - 1, min(n, _MAX_LOOPS)).round().astype(np.int64))
+    chosen = evenly(n, _MAX_LOOPS)
     ends = (elapsed(stamps_ns, first_ns) for stamps_ns in (loops.stamps_ns, loops.reference_ns))
     columns = (
         *([f"{end_s:.1f}" for end_s in each] for each in ends),
@@ -312,6 +313,7 @@ def _facts(record: RunRecord) -> dict[str, str]:
     summary, frames = record.summary, record.frames
     statuses = {status: frames.statuses.count(status) for status in dict.fromkeys(frames.statuses)}
     coverage, memory = summary.get("coverage_percent"), summary.get("peak_memory_mb")
+    version = summary.get("gvo_version")
     return {
         "Sensor": str(summary.get("sensor", "")),
         "Poses of": str(summary.get("base_frame", "")),
@@ -324,7 +326,7 @@ def _facts(record: RunRecord) -> dict[str, str]:
         "Learnt calibration errors": describe_offsets(summary.get("rig_offsets")),
         "Median per frame": _median_words(summary.get("median_ms")),
         "Peak memory": "" if memory is None else f"{float(memory):.0f} MB",
-        "Version": _version(summary),
+        "Version": "" if version is None else f"gvo {version}",
     }
 
 
@@ -350,8 +352,3 @@ def _duration(record: RunRecord) -> str:
 def _median_words(medians: Mapping[str, Any] | None) -> str:
     known = {stage: ms for stage, ms in (medians or {}).items() if ms is not None}
     return ", ".join(f"{stage} {float(ms):.1f} ms" for stage, ms in known.items())
-
-
-def _version(summary: Mapping[str, Any]) -> str:
-    version = summary.get("gvo_version")
-    return "" if version is None else f"gvo {version}"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -110,11 +110,9 @@ class Plot:
         return _inlined(buffer.getvalue(), self.slug, self.title)
 
 
-@contextmanager
-def settings() -> Iterator[None]:
+def settings() -> AbstractContextManager[None]:
     """Make and write figures in the style of the report within the context."""
-    with rc_context(_SETTINGS):  # type: ignore[arg-type,unused-ignore]
-        yield
+    return rc_context(_SETTINGS)  # type: ignore[arg-type,unused-ignore]
 
 
 def write_plots(plots: Sequence[Plot], folder: Path) -> list[Path]:
@@ -267,11 +265,6 @@ def draw_curve(
     lone = np.flatnonzero(is_gap[:-2] & ~is_gap[1:-1] & is_gap[2:])
     if len(lone) > 0:
         axes.plot(x[lone], y[lone], ".", ms=5.0, color=style.color, zorder=style.zorder)
-
-
-def elapsed(stamps_ns: IntArray, first_ns: int) -> FloatArray:
-    """Return seconds since a stamp."""
-    return np.asarray((stamps_ns - first_ns) / 1e9, dtype=np.float64)
 
 
 def _shortened(label: str) -> str:
