@@ -78,15 +78,12 @@ def value_medians(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
 
 def _by_value(values: pd.Series, runs: pd.DataFrame) -> pd.DataFrame:
     grouped = runs.groupby(values, dropna=False, sort=is_numeric_dtype(values))
-    numbers = {
-        (measure, name): grouped[measure].quantile(share)
-        for measure in _MEASURES
-        for name, share in _QUANTILES.items()
-    }
+    numbers = {}
     for measure in _MEASURES:
-        for name in ("low", "high"):
-            quartile = numbers[measure, name]
-            numbers[measure, name] = quartile.where(grouped[measure].count() >= MIN_RUNS)
+        has_spread = grouped[measure].count() >= MIN_RUNS
+        for name, share in _QUANTILES.items():
+            quantile = grouped[measure].quantile(share)
+            numbers[measure, name] = quantile if name == "median" else quantile.where(has_spread)
     return pd.DataFrame(numbers | {("runs", kind): grouped[kind].sum() for kind in COUNTS})
 
 

@@ -10,6 +10,7 @@ from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path, PurePosixPath
+from typing import TypeVar
 
 from gvo._text import YamlError, cut, load_yaml, text_lines
 from gvo.batch.results import CSV, PARQUET
@@ -20,6 +21,7 @@ from gvo.errors import ConfigurationError, RecordingError
 from gvo.io.opening import BAG_SUFFIXES, FOLDER_MARKERS
 from gvo.io.run_folder.writer import REPORT
 
+T = TypeVar("T")
 _UNSAFE = re.compile(r"[^A-Za-z0-9._=,+-]+")
 _MAX_NAME = 150
 _LIST_SUFFIX = ".txt"
@@ -78,8 +80,7 @@ def find_recordings(asked: Sequence[str | Path]) -> list[NamedRecording]:
         if not found:
             raise RecordingError(f"{one}: no recording there")
         locations.update(dict.fromkeys(found))
-    names = _name(list(locations))
-    return [NamedRecording(name=names[each], location=each) for each in locations]
+    return _name(list(locations))
 
 
 def _expand(text: str) -> list[str]:
@@ -134,8 +135,8 @@ def _is_bag(name: str) -> bool:
     return name.removesuffix(_COMPRESSED).endswith(BAG_SUFFIXES)
 
 
-def _name(locations: Sequence[str]) -> dict[str, str]:
-    """Name each by the shortest end of its path that is unique."""
+def _name(locations: Sequence[str]) -> list[NamedRecording]:
+    """Name each by the shortest end of its path that is unique, unlike the batch's own files."""
     ends = {each: list(_ends(each)) for each in locations}
     names = {each: safe_name(ends[each][0]) for each in locations}
     for length in range(1, max(map(len, ends.values()))):
@@ -143,7 +144,8 @@ def _name(locations: Sequence[str]) -> dict[str, str]:
         for each in locations:
             if counts[names[each]] > 1:
                 names[each] = safe_name(ends[each][min(length, len(ends[each]) - 1)])
-    return _number(names)
+    named = _numbered(((name, each) for each, name in names.items()), _TAKEN)
+    return [NamedRecording(name=name, location=each) for name, each in named.items()]
 
 
 def _ends(location: str) -> Iterator[str]:
@@ -158,14 +160,12 @@ def _ends(location: str) -> Iterator[str]:
         yield "-".join([*parents[-n_parents:], last])
 
 
-def _number(names: dict[str, str]) -> dict[str, str]:
-    """Add numbers to equal names, and to those of the batch's own files."""
-    taken = set(_TAKEN)
-    numbered = {}
-    for each, name in names.items():
-        numbered[each] = free_name(name, taken)
-        taken.add(numbered[each])
-    return numbered
+def _numbered(named: Iterable[tuple[str, T]], taken: Container[str] = ()) -> dict[str, T]:
+    """Return values by their names, made valid as names of folders, and unique by numbers."""
+    found: dict[str, T] = {}
+    for name, value in named:
+        found[free_name(safe_name(name), found, taken)] = value
+    return found
 
 
 def safe_name(text: str) -> str:
@@ -179,7 +179,7 @@ def safe_name(text: str) -> str:
     return _UNSAFE.sub("_", text).lstrip(".")[:_MAX_NAME] or "_"
 
 
-def free_name(name: str, taken: Container[str]) -> str:
+def free_name(name: str, *taken: Container[str]) -> str:
     """Return a name, numbered if it is taken.
 
     Examples
@@ -188,7 +188,7 @@ def free_name(name: str, taken: Container[str]) -> str:
     'drive-3'
     """
     free, number = name, 2
-    while free in taken:
+    while any(free in names for names in taken):
         free, number = f"{name}-{number}", number + 1
     return free
 
@@ -233,7 +233,7 @@ def make_variants(
         raise ConfigurationError(f"--sweep {max(keys, key=keys.count)}: is given twice")
     if math.prod(map(len, grid)) * max(len(files), 1) > _MAX_VARIANTS:
         raise ConfigurationError(f"the sweep has more than {_MAX_VARIANTS} configurations")
-    bases: list[tuple[str, Path | None]] = [(name, file) for file, name in _names(files).items()]
+    bases = _numbered((file.stem, file) for file in dict.fromkeys(files)).items()
     named = []
     for (base, file), chosen in product(bases or [("", None)], product(*grid)):
         swept = dict(zip(keys, chosen, strict=True))
@@ -267,10 +267,8 @@ def name_variants(
 
 def _variants(named: Iterable[tuple[str, Config]]) -> list[Variant]:
     """Make the names unique, and valid as names of folders."""
-    variants: dict[str, Config] = {}
-    for name, config in named:
-        variants[free_name(safe_name(name or DEFAULT), variants)] = config
-    return [Variant(name=name, config=config) for name, config in variants.items()]
+    numbered = _numbered((name or DEFAULT, config) for name, config in named)
+    return [Variant(name=name, config=config) for name, config in numbered.items()]
 
 
 def differences(configs: Sequence[Config]) -> list[dict[str, Value]]:
@@ -319,13 +317,6 @@ def _parse_sweep(sweep: str) -> list[Value]:
     if len(set(texts)) < len(texts):
         raise ConfigurationError(f"{shown}: {max(texts, key=texts.count)} is given twice")
     return values
-
-
-def _names(files: Sequence[Path]) -> dict[Path, str]:
-    names: dict[str, Path] = {}
-    for file in dict.fromkeys(files):
-        names[free_name(safe_name(file.stem), names)] = file
-    return {file: name for name, file in names.items()}
 
 
 def _on_one_thread(config: Config) -> Config:

@@ -196,8 +196,8 @@ def test_no_run_folder_stands_where_the_batch_writes(name: str) -> None:
 @given(st.lists(st.text(min_size=1), min_size=1, unique=True))
 def test_every_name_is_unlike_all_others_and_fit_for_a_folder(texts: list[str]) -> None:
     given_names = name_all([f"/{text}" for text in texts])
-    assert list(given_names) == [f"/{text}" for text in texts]
-    made = list(given_names.values())
+    assert [each.location for each in given_names] == [f"/{text}" for text in texts]
+    made = [each.name for each in given_names]
     assert len(set(made)) == len(made)
     for name in made:
         assert re.fullmatch(r"[A-Za-z0-9_=,+-][A-Za-z0-9._=,+-]*", name)

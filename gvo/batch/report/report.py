@@ -70,7 +70,7 @@ def write_batch_report(
     """
     if not rows:
         raise ValueError("expected at least one row")
-    batch = Batch.of(rows)
+    batch = Batch(rows)
     with settings(), warnings.catch_warnings():
         # the page takes its fonts from the reader's machine
         warnings.filterwarnings("ignore", message="Glyph .* missing from")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import takewhile
 from typing import Literal
 
@@ -29,13 +28,15 @@ _MARGIN = 0.06
 _SERIES: tuple[tuple[float, ...], ...] = ((1.0,), (1.0, 3.0), (1.0, 2.0, 5.0))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Batch:
     """The rows of a batch, and what its plots share.
 
     Parameters
     ----------
-    rows : tuple of BatchRow, length n
+    rows : sequence of BatchRow, length n
+
+    Attributes
+    ----------
     table : DataFrame
         The rows, as `results.csv` holds them.
     means : DataFrame
@@ -48,26 +49,11 @@ class Batch:
         A sentence on what the short names mean, if they need one.
     """
 
-    rows: tuple[BatchRow, ...]
-    table: pd.DataFrame
-    means: pd.DataFrame
-    default: str | None
-    labels: Mapping[str, str]
-    label_words: str
-
-    @classmethod
-    def of(cls, rows: Sequence[BatchRow]) -> Batch:
-        """Compare the rows and name their configurations."""
-        table = to_frame(rows)
-        labels, label_words = _labels(rows)
-        return cls(
-            rows=tuple(rows),
-            table=table,
-            means=variant_means(table),
-            default=_default_of(rows),
-            labels=labels,
-            label_words=label_words,
-        )
+    def __init__(self, rows: Sequence[BatchRow]) -> None:
+        self.rows, self.table = tuple(rows), to_frame(rows)
+        self.means = variant_means(self.table)
+        self.default = _default_of(rows)
+        self.labels, self.label_words = _labels(rows)
 
     @property
     def is_sweep(self) -> bool:
