@@ -29,10 +29,7 @@ _LOGGER = logging.getLogger(__name__)
 _SPAN_NS = 1_000_000_000
 _MOST_OFF_NS = 500_000_000
 _EDGE = np.dtype(
-    [
-        *(("reference_id", "i8"), ("T_reference_frame", "f8", (4, 4))),
-        ("covariance", "f8", (6, 6)),
-    ]
+    [("reference_id", "i8"), ("T_reference_frame", "f8", (4, 4)), ("covariance", "f8", (6, 6))]
 )
 
 
@@ -209,10 +206,8 @@ class RunLoop:
 
     def _n_expected(self, stamp_ns: int) -> int:
         """Estimate the number of images in all, from the stamps so far."""
-        n_images, n_done = (
-            self.source.info.n_images,
-            self.statistics.n_frames + self.statistics.n_unpaired,
-        )
+        n_images = self.source.info.n_images
+        n_done = self.statistics.n_frames + self.statistics.n_unpaired
         if self._first_ns is None:
             self._first_ns = stamp_ns
         if n_done < 2:
@@ -223,11 +218,9 @@ class RunLoop:
 
     def _read(self) -> Iterator[Frame | FaultyFrame]:
         items = self._items
-        iterator = (
-            frames(self.source, self.config, self._excerpt, through=self._through)
-            if items is None
-            else iter(items)
-        )
+        if items is None:
+            items = frames(self.source, self.config, self._excerpt, through=self._through)
+        iterator = iter(items)
         while True:
             start = time.perf_counter()
             try:

@@ -45,8 +45,9 @@ _MAX_FOREIGN_LINES = 1000
 
 @dataclass(slots=True, kw_only=True)
 class SmoothingNotes:
-    """Decisions and warnings of a run."""
+    """Name, decisions and warnings of a run."""
 
+    recording: str = ""
     decisions: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     broken_off: str = ""
@@ -60,6 +61,8 @@ class Smoother:
     folder : RunFolder
         Open.
     config : Config
+    notes : SmoothingNotes, optional
+        Of the run.
     keyframes : {"manual", "distance"}
         As of `SlidingWindow`.
     graph_file : GraphFile, optional
@@ -70,19 +73,26 @@ class Smoother:
         self,
         folder: RunFolder,
         config: Config,
+        notes: SmoothingNotes | None = None,
         *,
         keyframes: Keeping = "distance",
         graph_file: GraphFile | None = None,
     ) -> None:
+        self.folder, self.config, self._graph_file = folder, config, graph_file
+        self.notes = notes or SmoothingNotes()
         self.window = SlidingWindow(config.window, keyframes=keyframes)
         self.statuses: Counter[Status] = Counter()
-        self._folder, self._graph_file = folder, graph_file
         self.chain = EdgeChain(config.window)
 
     @property
     def n_poses(self) -> int:
         """Poses taken in."""
         return sum(self.statuses.values())
+
+    @property
+    def n_tracked(self) -> int:
+        """Poses that edges connect with earlier ones."""
+        return self.statuses[Status.OK] + self.statuses[Status.RESUMED]
 
     def take(self, event: Event) -> Estimate | Rejected:
         """Add a pose, or an edge between two poses of the window."""
@@ -103,7 +113,7 @@ class Smoother:
         self.statuses[causal.status] += 1
         reason = str(causal.rejected[0]) if causal.rejected else ""
         row = (causal.stamp_ns, causal.frame_id, causal.status, len(event.edges))
-        self._folder.add_poses(raw, causal, (*row, len(causal.rejected), reason))
+        self.folder.add_poses(raw, causal, (*row, len(causal.rejected), reason))
         self._add_finished(self.window.pop_finished())
         return causal
 
@@ -112,7 +122,7 @@ class Smoother:
         self._add_finished(self.window.finish())
 
     def _add_finished(self, finished: list[Estimate]) -> None:
-        self._folder.add_smoothed(finished)
+        self.folder.add_smoothed(finished)
         if self._graph_file is not None:
             for each in finished:
                 self._graph_file.add(each.stamp_ns, each.frame_id, each.T_world_frame)
@@ -161,18 +171,18 @@ def smooth_edges(
     RecordingError
         When the input holds no pose, or the folder holds an earlier run or cannot be written.
     """
-    config = config or Config()
-    notes = SmoothingNotes(decisions=source.decisions)
+    notes = SmoothingNotes(recording=source.name, decisions=source.decisions)
     with _opened(Path(out), source, force=force) as (folder, graph_file):
-        smoother = Smoother(folder, config, keyframes=keyframes, graph_file=graph_file)
-        with _finished(source.name, folder, smoother, notes):
+        smoother = Smoother(
+            folder, config or Config(), notes, keyframes=keyframes, graph_file=graph_file
+        )
+        with _finished(smoother):
             for event in _events(source, notes):
                 smoother.take(event)
                 if on_progress is not None:
                     on_progress(_progress(smoother, source.n_poses))
     notes.warnings += source.faults.warnings()
-    truth = _with_stamps(ground_truth, source, folder)
-    return _conclude(source.name, folder, smoother, config, notes, truth, on_written)
+    return _conclude(smoother, _with_stamps(ground_truth, source, folder), on_written)
 
 
 @contextmanager
@@ -208,11 +218,9 @@ def _poses_counted(out: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _finished(
-    name: str, folder: RunFolder, smoother: Smoother, notes: SmoothingNotes
-) -> Iterator[None]:
+def _finished(smoother: Smoother) -> Iterator[None]:
     """Write what the window holds, also where the work ends early, and then how far it came."""
-    folder.write_summary(_summary(name, smoother, notes) | {"state": "running"})
+    smoother.folder.write_summary(_summary(smoother) | {"state": "running"})
     try:
         try:
             yield
@@ -220,9 +228,9 @@ def _finished(
             smoother.finish()
     except (OutputError, KeyboardInterrupt) as error:
         reason = str(error) or "interrupted"
-        summary = _summary(name, smoother, notes) | {"state": "interrupted", "warnings": [reason]}
+        summary = _summary(smoother) | {"state": "interrupted", "warnings": [reason]}
         with suppress(OutputError):
-            folder.write_summary(summary)
+            smoother.folder.write_summary(summary)
         raise
 
 
@@ -235,9 +243,8 @@ def _events(source: EdgeSource, notes: SmoothingNotes) -> Iterator[Event]:
 
 
 def _progress(smoother: Smoother, n_total: int) -> Progress:
-    n_tracked = smoother.statuses[Status.OK] + smoother.statuses[Status.RESUMED]
     n_done = smoother.n_poses
-    return Progress(n_done=n_done, n_total=max(n_total, n_done), n_tracked=n_tracked)
+    return Progress(n_done=n_done, n_total=max(n_total, n_done), n_tracked=smoother.n_tracked)
 
 
 def _with_stamps(
@@ -255,30 +262,25 @@ def _with_stamps(
 
 
 def _conclude(
-    name: str,
-    folder: RunFolder,
-    smoother: Smoother,
-    config: Config,
-    notes: SmoothingNotes,
-    truth: Trajectory | None,
-    on_written: Callable[[], None] | None,
+    smoother: Smoother, truth: Trajectory | None, on_written: Callable[[], None] | None
 ) -> RunResult:
     """Write summary and picture of a finished run, and compare with the truth."""
+    folder, notes = smoother.folder, smoother.notes
     if smoother.n_poses == 0:
         folder.discard()
-        raise _nothing_to_smooth(name, notes)
+        raise _nothing_to_smooth(notes)
     estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
-    summary = {**_summary(name, smoother, notes), "configuration": config.model_dump()}
+    summary = {**_summary(smoother), "configuration": smoother.config.model_dump()}
     warnings = [*_broken_off(smoother.n_poses, notes), *_warnings(smoother), *notes.warnings]
     counts = smoother.window.counts
     is_complete = not (notes.broken_off or notes.warnings or counts.n_coasting or counts.n_rejected)
     return _written(folder, summary, estimates, truth, warnings, is_complete, on_written)
 
 
-def _nothing_to_smooth(name: str, notes: SmoothingNotes) -> RecordingError:
+def _nothing_to_smooth(notes: SmoothingNotes) -> RecordingError:
     """Return the error of an input that gave no pose."""
     reason = notes.broken_off or "; ".join(notes.warnings) or "it holds no pose"
-    return RecordingError(f"{name}: nothing to smooth: {reason}")
+    return RecordingError(f"{notes.recording}: nothing to smooth: {reason}")
 
 
 def _written(
@@ -341,15 +343,14 @@ def _warnings(smoother: Smoother) -> Iterator[str]:
         yield f"{counts.n_restored} updates failed and were done again with less"
 
 
-def _summary(name: str, smoother: Smoother, notes: SmoothingNotes) -> dict[str, Any]:
-    n_tracked = smoother.statuses[Status.OK] + smoother.statuses[Status.RESUMED]
+def _summary(smoother: Smoother) -> dict[str, Any]:
     batch_result = smoother.window.batch_result
     return {
         "gvo_version": __version__,
-        "recording": name,
-        "decisions": notes.decisions,
+        "recording": smoother.notes.recording,
+        "decisions": smoother.notes.decisions,
         "frames": smoother.n_poses,
-        "tracked": n_tracked,
+        "tracked": smoother.n_tracked,
         "status_counts": {status.value: smoother.statuses[status] for status in Status},
         "window": asdict(smoother.window.counts),
         "batch": None if batch_result is None else batch_result.as_json(),
@@ -478,11 +479,11 @@ def optimize_edges(
         If GTSAM fails.
     """
     robust = robust or ("none" if isinstance(source, PoseGraphSource) else "huber")
-    notes = SmoothingNotes(decisions=source.decisions)
+    notes = SmoothingNotes(recording=source.name, decisions=source.decisions)
     graph = read_graph(source, notes)
     notes.warnings += source.faults.warnings()
     if not graph.frame_ids:
-        raise _nothing_to_smooth(source.name, notes)
+        raise _nothing_to_smooth(notes)
     optimizer = BatchOptimizer(graph, robust, on_step=on_step)
     with _opened(Path(out), source, force=force, names=("raw", "smoothed")) as (folder, file):
         found = None
@@ -523,9 +524,8 @@ def _rows(graph: WholeGraph, optimizer: BatchOptimizer) -> Iterator[tuple[object
     refused = Counter(end for link in optimizer.refused for end in (link.reference, link.frame))
     invalid = {rejected.frame_id: str(rejected) for rejected in reversed(graph.rejected)}
     n_invalid = Counter(rejected.frame_id for rejected in graph.rejected)
-    for number, (frame_id, stamp_ns) in enumerate(
-        zip(graph.frame_ids, graph.stamps_ns, strict=True)
-    ):
+    poses = zip(graph.frame_ids, graph.stamps_ns, strict=True)
+    for number, (frame_id, stamp_ns) in enumerate(poses):
         n_rejected = refused[number] + n_invalid[frame_id]
         reason = invalid.get(frame_id, "others contradict an edge" if n_rejected else "")
         status = Status.OK if number in there else Status.SKIPPED
@@ -534,9 +534,7 @@ def _rows(graph: WholeGraph, optimizer: BatchOptimizer) -> Iterator[tuple[object
 
 def _left_out(graph: WholeGraph, optimizer: BatchOptimizer) -> Iterator[str]:
     if graph.rejected:
-        yield (
-            f"{len(graph.rejected)} edges or priors were refused; the first: {graph.rejected[0]}"
-        )
+        yield f"{len(graph.rejected)} edges or priors were refused; the first: {graph.rejected[0]}"
     n_left_out = len(graph.frame_ids) - len(optimizer.numbers)
     if n_left_out:
         yield (
@@ -587,12 +585,10 @@ def smooth_lines(
     RecordingError
         When no line held a pose, or the folder holds an earlier run or cannot be written.
     """
-    config = config or Config()
-    faults, notes = InputFaults(), SmoothingNotes()
-    out, name = Path(out), "standard input"
-    with _opened(out, None, force=force) as (folder, _):
-        smoother = Smoother(folder, config, keyframes=keyframes)
-        with _finished(name, folder, smoother, notes):
+    faults, notes = InputFaults(), SmoothingNotes(recording="standard input")
+    with _opened(Path(out), None, force=force) as (folder, _):
+        smoother = Smoother(folder, config or Config(), notes, keyframes=keyframes)
+        with _finished(smoother):
             try:
                 _answer_all(lines, answer, smoother, faults)
             except OSError as error:
@@ -601,7 +597,7 @@ def smooth_lines(
             except TrajectoryError as error:
                 notes.broken_off = str(error)
     notes.warnings += faults.warnings()
-    return _conclude(name, folder, smoother, config, notes, ground_truth, on_written)
+    return _conclude(smoother, ground_truth, on_written)
 
 
 def _answer_all(
@@ -642,14 +638,9 @@ def _reply(request: Request, smoother: Smoother, line_format: LineFormat) -> str
 def _add(request: Request, smoother: Smoother) -> Estimate:
     if request.stamp_ns is None:
         raise ValueError(f"{request.frame_id!r} is not in the window; a new pose needs a stamp")
-    return smoother.add_pose(
-        PoseEvent(
-            frame_id=request.frame_id,
-            stamp_ns=request.stamp_ns,
-            edges=request.edges,
-            prior=request.prior,
-        )
-    )
+    frame_id, edges, prior = request.frame_id, request.edges, request.prior
+    event = PoseEvent(frame_id=frame_id, stamp_ns=request.stamp_ns, edges=edges, prior=prior)
+    return smoother.add_pose(event)
 
 
 def _extend(request: Request, smoother: Smoother) -> tuple[Estimate, list[Rejected]]:

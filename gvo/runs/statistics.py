@@ -111,11 +111,8 @@ class RunStatistics:
     @property
     def unjoined(self) -> list[Segment]:
         """The segments with tracked frames that are not joined to an earlier one."""
-        return [
-            segment
-            for segment in self.segments.values()
-            if segment.joined_to is None and segment.n_tracked > 0
-        ]
+        tracked = [segment for segment in self.segments.values() if segment.n_tracked > 0]
+        return [segment for segment in tracked if segment.joined_to is None]
 
     def as_json(self) -> dict[str, Any]:
         """Return what `summary.json` holds of it."""
@@ -143,9 +140,8 @@ class RunStatistics:
 
     def progress(self, n_images: int) -> Progress:
         """Return how far the run is, of so many images."""
-        return Progress(
-            n_done=self.n_frames + self.n_unpaired, n_total=n_images, n_tracked=self.n_tracked
-        )
+        n_done = self.n_frames + self.n_unpaired
+        return Progress(n_done=n_done, n_total=n_images, n_tracked=self.n_tracked)
 
     def add_result(self, result: FrameResult) -> None:
         """Count a frame."""
@@ -263,13 +259,9 @@ class RunStatistics:
 
     def _warnings_of_window(self) -> Iterator[str]:
         if self.window.n_restored:
-            yield (
-                f"{self.window.n_restored} updates of the window failed and were done again with "
-                "less"
-            )
+            n = self.window.n_restored
+            yield f"{n} updates of the window failed and were done again with less"
         # Gating is the window's daily work, and counted in the summary; anything else is a fault.
         n_faulty = self.window.n_rejected - self.window.n_gated
         if n_faulty:
-            yield (
-                f"{n_faulty} edges were refused; the first refusal: {self.window.first_rejected}"
-            )
+            yield f"{n_faulty} edges were refused; the first refusal: {self.window.first_rejected}"

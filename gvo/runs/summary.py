@@ -136,9 +136,16 @@ def run_identity(
     dict
         Plain values, as `summary.json` gives them back.
     """
+    info = source.info
     return {
         "version of gvo": __version__,
-        "recording": _describe_recording(source, is_live=is_live),
+        "recording": {
+            "sensor": info.sensor,
+            "number of images": info.n_images,
+            "frame_id": info.frame_id,
+            "calibration": _digest(_calibration_parts(info)),
+            "first images": {} if is_live else dict(_first_images(source)),
+        },
         "excerpt": asdict(excerpt or Excerpt()),
         "output": {
             "frame": base_frame.name,
@@ -146,17 +153,6 @@ def run_identity(
             "initial pose": _digest_of(base_frame.T_initial),
             "true start": "" if start is None else _digest_of(start.T_world_frame),
         },
-    }
-
-
-def _describe_recording(source: Source, *, is_live: bool) -> dict[str, Any]:
-    info = source.info
-    return {
-        "sensor": info.sensor,
-        "number of images": info.n_images,
-        "frame_id": info.frame_id,
-        "calibration": _digest(_calibration_parts(info)),
-        "first images": {} if is_live else dict(_first_images(source)),
     }
 
 
