@@ -31,7 +31,7 @@ _DRAWN = {*_PATHS, "truth", "ellipsoids", "loops", "refused loops"}
 _NOT_RECORDED = {"keyframes", "links", "image", "points", "cloud"}
 
 
-def serve_record(folder: Path, *, host: str, port: int, name: str = "") -> ViewServer:
+def serve_record(folder: Path, *, host: str, port: int, name: str) -> ViewServer:
     """Serve the page of a run folder; see `gvo.viz.view.serve`."""
     record = read_run(folder)
     if len(record.frames.stamps_ns) == 0:

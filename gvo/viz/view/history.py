@@ -63,26 +63,18 @@ class FrameView(FrameRecord):
     ----------
     index : int
         Of the frame in the recording, from 0; faulty ones count.
-    n_done : int
-        Frames that are done: the index of the last one, and 1.
     T_world_frame : ndarray of float64, shape (4, 4)
         Causal pose; for a faulty frame that of the frame before, the identity before any.
-    fault : str
-        What the player has to tell; empty while all is well.
     """
 
     index: int
-    n_done: int
     T_world_frame: FloatArray
-    fault: str = ""
 
     @classmethod
-    def of(
-        cls, record: FrameRecord, *, index: int, n_done: int, T_world_frame: FloatArray, fault: str
-    ) -> FrameView:
+    def of(cls, record: FrameRecord, index: int, T_world_frame: FloatArray) -> FrameView:
         """Return a record with what was known with it."""
         kept = {field.name: getattr(record, field.name) for field in fields(record)}
-        return cls(**kept, index=index, n_done=n_done, T_world_frame=T_world_frame, fault=fault)
+        return cls(**kept, index=index, T_world_frame=T_world_frame)
 
     @property
     def status(self) -> Status | None:
@@ -185,15 +177,13 @@ class History:
         self._check(index)
         return self._told[index - self.first_index][0]
 
-    def frame_view(self, index: int | None = None, *, fault: str = "") -> FrameView:
+    def frame_view(self, index: int | None = None) -> FrameView:
         """Return what a page shows of a frame.
 
         Parameters
         ----------
         index : int, optional
             The one that is shown where omitted.
-        fault : str
-            As of `FrameView`.
 
         Raises
         ------
@@ -204,10 +194,7 @@ class History:
             index = self.shown if index is None else index
             record = self._record(index)
             _, causal = self._known("causal", index)
-            T = causal[-1] if len(causal) else np.eye(4)
-            return FrameView.of(
-                record, index=index, n_done=self.n_done, T_world_frame=T, fault=fault
-            )
+            return FrameView.of(record, index, causal[-1] if len(causal) else np.eye(4))
 
     def path(self, name: str) -> Path:
         """Return stamps (n,) and positions (n, 3) up to the frame shown.

@@ -122,10 +122,7 @@ class LivePlayer:
                 index=shown.number,
                 depth=self.config.depth,
             )
-            T, n_done = shown.T_world_frame, shown.number + 1
-            self._view = FrameView.of(
-                record, index=shown.number, n_done=n_done, T_world_frame=T, fault=""
-            )
+            self._view = FrameView.of(record, shown.number, shown.T_world_frame)
         return self._view
 
     def subscribe(self, callback: Callable[[object], object]) -> Callable[[], None]:

@@ -37,12 +37,7 @@ _NOTHING = np.zeros((0, 3))
 
 
 def serve_player(
-    player: Player | LivePlayer,
-    *,
-    host: str,
-    port: int,
-    truth: Trajectory | None = None,
-    name: str = "",
+    player: Player | LivePlayer, *, host: str, port: int, truth: Trajectory | None, name: str
 ) -> ViewServer:
     """Serve a player's page, at its first frame or where it is; see `gvo.viz.view.serve`."""
     view = open_server(host, port, title=f"gvo {name or player.source.info.name}".strip())
@@ -61,16 +56,12 @@ class Page:
     ----------
     server : viser.ViserServer
     player : Player or LivePlayer
-    truth : Trajectory, optional
+    truth : Trajectory or None
         Of the camera, in any world.
     """
 
     def __init__(
-        self,
-        server: viser.ViserServer,
-        player: Player | LivePlayer,
-        *,
-        truth: Trajectory | None = None,
+        self, server: viser.ViserServer, player: Player | LivePlayer, *, truth: Trajectory | None
     ) -> None:
         self._server, self._player = server, player
         self._truth = None if truth is None else TruthPath(truth)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import viser
@@ -16,6 +16,9 @@ from gvo.types import FloatArray, FrameResult
 from gvo.viz.view.live import LivePlayer
 from gvo.viz.view.player import Player, RunPlayer
 from gvo.viz.view.scene import COLOURS, LAYERS, Scene, Up, position_sigmas
+
+Playable: TypeAlias = Player | RunPlayer
+"""What goes to any of its frames, at any speed."""
 
 MAIN_WIDTH_PX = 330
 FRAME_WIDTH_PX = 430
@@ -126,11 +129,8 @@ class ViewPoint:
         norm = float(np.linalg.norm(forward))
         forward = forward / norm if norm > 1e-6 else T_world_frame[:3, 0]
         self._last = start = T_world_frame[:3, 3].copy()
-        self.look(
-            start - distance_m * forward + 0.6 * distance_m * self._up,
-            start + distance_m * forward,
-            distance_m,
-        )
+        step = distance_m * forward
+        self.look(start - step + 0.6 * distance_m * self._up, start + step, distance_m)
 
     def look_down(self, positions_world: FloatArray) -> None:
         """Look from above and aside at all positions, shape (n, 3), metres."""
@@ -285,11 +285,7 @@ class PauseButtons:
     _NAMES: tuple[str, ...] = ("play", "pause")
 
     def __init__(
-        self,
-        gui: viser.GuiApi,
-        playable: Player | RunPlayer | LivePlayer,
-        *,
-        before: Callable[[], None],
+        self, gui: viser.GuiApi, playable: Playable | LivePlayer, *, before: Callable[[], None]
     ) -> None:
         self._shown, self._before = playable, before
         buttons = gui.add_button_group(self._LABEL, self._NAMES)
@@ -322,7 +318,7 @@ class Playback(PauseButtons):
     _NAMES = ("play", "pause", "step")
 
     def __init__(
-        self, gui: viser.GuiApi, playable: Player | RunPlayer, *, before: Callable[[], None]
+        self, gui: viser.GuiApi, playable: Playable, *, before: Callable[[], None]
     ) -> None:
         super().__init__(gui, playable, before=before)
         self._playable = playable

@@ -267,7 +267,7 @@ class Player(AbstractContextManager["Player"]):
         """The frame shown; None before there is any."""
         history = self.history
         is_any = history.shown >= history.first_index
-        return history.frame_view(fault=self.fault) if is_any else None
+        return history.frame_view() if is_any else None
 
     # On the thread
 
@@ -275,7 +275,9 @@ class Player(AbstractContextManager["Player"]):
         with one_opencv_thread():
             while self._wait_for_work():
                 if not self._guarded(self._turn):
-                    self._forget_commands()
+                    with self._changed:
+                        self.is_playing = self._is_stepping = False
+                        self._goal = self._restart_index = None
                     self._publish()
         self._guarded(self._tracking.close)
 
@@ -300,11 +302,6 @@ class Player(AbstractContextManager["Player"]):
         else:
             return True
         return False
-
-    def _forget_commands(self) -> None:
-        with self._changed:
-            self.is_playing = self._is_stepping = False
-            self._goal = self._restart_index = None
 
     def _publish(self) -> None:
         """Tell all subscribers of the frame shown."""

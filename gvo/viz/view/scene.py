@@ -123,7 +123,8 @@ class Path:
         for number, corners in self._corners.update(positions.astype(np.float32)).items():
             segments = np.stack([corners[:-1], corners[1:]], axis=1)
             if self._is_dashed:
-                segments = segments[_dashes(len(segments))]
+                # Two of three are drawn, and all of a few.
+                segments = segments[(np.arange(len(segments)) % 3 != 2) | (len(segments) < 3)]
             if number not in self._chunks:
                 thickness_px = 2.0 if self._is_dashed else 3.0
                 self._chunks[number] = Segments(
@@ -155,12 +156,6 @@ class Cloud:
                 )
 
 
-def _dashes(n: int) -> NDArray[np.bool_]:
-    """Return which of n segments are drawn: two of three, and all of a few."""
-    drawn: NDArray[np.bool_] = (np.arange(n) % 3 != 2) | (n < 3)
-    return drawn
-
-
 class ChunkedArray:
     """Cuts rows into chunks of equal size and finds those that differ from before.
 
@@ -178,9 +173,8 @@ class ChunkedArray:
 
     def update(self, rows: NDArray[Any]) -> dict[int, NDArray[Any]]:
         """Return the chunks of rows (n, m) that changed, by number; an empty one went away."""
-        before, self._rows = self._rows, rows.copy()
-        if before is None:
-            before = rows[:0]
+        before = rows[:0] if self._rows is None else self._rows
+        self._rows = rows.copy()
         n_same = _common_prefix(before, rows)
         if n_same == len(before) == len(rows):
             return {}

@@ -60,12 +60,7 @@ class Tracking:
     """
 
     def __init__(
-        self,
-        open_source: OpenSource,
-        config: Config,
-        excerpt: Excerpt,
-        *,
-        from_ns: int | None = None,
+        self, open_source: OpenSource, config: Config, excerpt: Excerpt, from_ns: int | None = None
     ) -> None:
         self._open_source, self._excerpt, self.config = open_source, excerpt, config
         self.is_finished = False
@@ -145,7 +140,14 @@ class Tracking:
         if item is None:
             return None
         self.is_finished = True  # unless all goes well
-        record = self._record(item, index)
+        result = None
+        if not isinstance(item, FaultyFrame):
+            result = self._odometry.track(item)
+            result = replace(result, stage_ms={"read": self._read_ms, **result.stage_ms})
+            self._recorder.note(result)
+        poses = self._recorder.read(self._odometry.window)
+        depth = self.config.depth
+        record = self._recorder.record(item, result, poses, index=index, depth=depth)
         self._last_ns, self._next, self.is_finished = item.stamp_ns, None, False
         return record
 
@@ -157,15 +159,6 @@ class Tracking:
         """Close threads and files of the reading."""
         if isinstance(self._items, Generator):
             self._items.close()
-
-    def _record(self, frame: Frame | FaultyFrame, index: int) -> FrameRecord:
-        result = None
-        if not isinstance(frame, FaultyFrame):
-            result = self._odometry.track(frame)
-            result = replace(result, stage_ms={"read": self._read_ms, **result.stage_ms})
-            self._recorder.note(result)
-        poses = self._recorder.read(self._odometry.window)
-        return self._recorder.record(frame, result, poses, index=index, depth=self.config.depth)
 
 
 class FrameRecorder:

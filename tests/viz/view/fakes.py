@@ -53,14 +53,13 @@ def result_of(index: int) -> FrameResult:
     )
 
 
-def frame_view_of(index: int, *, fault: str = "", is_faulty: bool = False) -> FrameView:
+def frame_view_of(index: int, *, is_faulty: bool = False) -> FrameView:
     """What the page is given of a frame."""
     picture = np.full((120, 160, 3), index, dtype=np.uint8)
     points = np.random.default_rng(index).uniform(1.0, 9.0, (50, 3)).astype(np.float32)
     known = {int(stamp): pose_of(i) for i, stamp in enumerate(stamps_of(index + 1))}
     return FrameView(
         index=index,
-        n_done=index + 1,
         stamp_ns=PERIOD_NS * index,
         result=None if is_faulty else result_of(index),
         reason="truncated image" if is_faulty else "",
@@ -70,7 +69,6 @@ def frame_view_of(index: int, *, fault: str = "", is_faulty: bool = False) -> Fr
         T_world_frame=pose_of(index),
         window_poses=known,
         window_covariances={stamp: np.eye(6) * 1e-4 for stamp in known},
-        fault=fault,
     )
 
 
@@ -122,9 +120,9 @@ class FakePlayer:
         self.fault = ""
         self.callbacks: list[Callable[[FrameView], None]] = []
 
-    def show(self, view: FrameView) -> None:
+    def show(self, view: FrameView, *, fault: str = "") -> None:
         self.frame_view = view
-        self.fault = view.fault
+        self.fault = fault
         self.history.n = view.index + 1
         for callback in self.callbacks:
             callback(view)

@@ -61,7 +61,7 @@ def player(window: FakeWindow) -> LivePlayer:
 
 @pytest.fixture
 def page(view: ViewServer, player: LivePlayer) -> Iterator[Page]:
-    opened = Page(view.viser, player)
+    opened = Page(view.viser, player, truth=None)
     yield opened
     opened.close()
 

@@ -31,13 +31,15 @@ def player() -> FakePlayer:
 
 @pytest.fixture
 def page(view: ViewServer, player: FakePlayer) -> Iterator[Page]:
-    opened = Page(view.viser, cast(Any, player))
+    opened = Page(view.viser, cast(Any, player), truth=None)
     yield opened
     opened.close()
 
 
-def show(page: Page, player: FakePlayer, index: int, **options: Any) -> None:
-    player.show(frame_view_of(index, **options))
+def show(
+    page: Page, player: FakePlayer, index: int, *, fault: str = "", is_faulty: bool = False
+) -> None:
+    player.show(frame_view_of(index, is_faulty=is_faulty), fault=fault)
     page.settle()
 
 
@@ -169,7 +171,7 @@ def test_the_truth_is_laid_onto_the_first_pose(view: ViewServer, player: FakePla
 
 
 def test_a_closed_page_lets_go_of_the_player(view: ViewServer, player: FakePlayer) -> None:
-    page = Page(view.viser, cast(Any, player))
+    page = Page(view.viser, cast(Any, player), truth=None)
     assert len(player.callbacks) == 1
     page.close()
     assert player.callbacks == []

@@ -135,7 +135,7 @@ def test_a_frame_that_is_done_is_shown_as_it_was(player: Player) -> None:
     go(player, 7)
     go(player, 3)
     then, now = views[3], views[-1]
-    assert (now.index, now.n_done, player.n_done) == (3, 8, 8)
+    assert (now.index, player.n_done) == (3, 8)
     assert now.status == then.status
     np.testing.assert_array_equal(now.T_world_frame, then.T_world_frame)
     np.testing.assert_array_equal(now.cloud[0], then.cloud[0])
@@ -152,14 +152,15 @@ def test_steps_go_through_what_is_done_and_on(player: Player) -> None:
     for _ in range(4):
         player.step()
     assert player.wait(LIMIT_S)
-    assert [(view.index, view.n_done) for view in views][-2:] == [(3, 4), (4, 5)]
+    assert [view.index for view in views][-2:] == [3, 4]
+    assert player.n_done == 5
     assert not player.is_playing
 
 
 @pytest.mark.parametrize("tell", ["pause", "seek"])
 def test_the_way_to_a_frame_can_be_interrupted(player: Player, tell: str) -> None:
     def interrupt(view: FrameView) -> None:
-        if (view.index, view.n_done) == (4, 5):
+        if (view.index, player.n_done) == (4, 5):
             player.pause() if tell == "pause" else player.seek(1)
 
     player.subscribe(interrupt)
@@ -278,7 +279,7 @@ def test_a_configuration_that_cannot_be_read_with_leaves_the_former_one() -> Non
         player.reconfigure(change(images={"black": 7}, klt={"n_corners": 50}))
         player.step()
         assert player.wait(LIMIT_S)
-        assert views[-1].fault == player.fault == "black is not black; take 0"
+        assert player.fault == "black is not black; take 0"
         assert player.config == Config()
         go(player, N_FRAMES - 1)
         assert [view.stamp_ns for view in views[:-1]] == stamps_ns()
