@@ -80,19 +80,15 @@ def plot_trajectories(
         )
     if not estimates or any(len(estimate) == 0 for estimate in estimates.values()):
         raise ValueError("expected at least one estimate, and poses in each")
-    styles = styles_of(estimates)
     if reference is None:
-        figure = _figure_of_positions(estimates, styles)
+        figure = _figure_of_positions(estimates)
     else:
-        figure = _figure_of_errors(reference, estimates, styles, align)
+        figure = _figure_of_errors(reference, estimates, align)
     save_figure(figure, path)
 
 
 def _figure_of_errors(
-    reference: Trajectory,
-    estimates: Mapping[str, Trajectory],
-    styles: Sequence[Style],
-    align: AlignMode,
+    reference: Trajectory, estimates: Mapping[str, Trajectory], align: AlignMode
 ) -> Figure:
     compared = [compare(reference, e, name=name, align=align) for name, e in estimates.items()]
     first_ns = min(int(each.reference.stamps_ns[0]) for each in compared)
@@ -102,7 +98,7 @@ def _figure_of_errors(
     view, errors = figure.subplots(1, 2)
     plane = ground_plane(reference)
     _draw_path(view, shown, plane, REFERENCE_STYLE, "reference")
-    for each, style in zip(compared, styles, strict=True):
+    for each, style in zip(compared, styles_of(estimates), strict=True):
         label = f"{plain(each.name)} (ATE {each.ate_m:.3g} m)"
         _draw_path(view, each.trajectory, plane, style, label)
         elapsed_s = elapsed(each.reference.stamps_ns, int(shown.stamps_ns[0]))
@@ -115,12 +111,12 @@ def _figure_of_errors(
     return figure
 
 
-def _figure_of_positions(estimates: Mapping[str, Trajectory], styles: Sequence[Style]) -> Figure:
+def _figure_of_positions(estimates: Mapping[str, Trajectory]) -> Figure:
     start = min(estimates.values(), key=lambda estimate: int(estimate.stamps_ns[0]))
     figure = _new_figure(_SIZE_INCHES)
     axes = figure.subplot_mosaic([["view", axis] for axis in "xyz"])
     view, panels = axes["view"], [axes[axis] for axis in "xyz"]
-    for (name, estimate), style in zip(estimates.items(), styles, strict=True):
+    for (name, estimate), style in zip(estimates.items(), styles_of(estimates), strict=True):
         _draw_path(view, estimate, (0, 2), style, plain(name))
         elapsed_s = elapsed(estimate.stamps_ns, int(start.stamps_ns[0]))
         for axis, panel in enumerate(panels):

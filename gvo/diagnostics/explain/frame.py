@@ -6,19 +6,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from gvo._trace import Trace, watched
 from gvo.config import Config
-from gvo.diagnostics.explain.steps import (
-    Registration,
-    describe,
-    explain_consensus,
-    explain_depth_pixels,
-    explain_keypoints,
-    explain_matches,
-    explain_measured,
-    explain_refinement,
-    explain_rows,
-    explain_subpixel,
-    registrations_of,
-)
+from gvo.diagnostics.explain import steps
+from gvo.diagnostics.explain.steps import Registration, describe, registrations_of
 from gvo.diagnostics.explain.values import FrameExplanation, Step
 from gvo.errors import RecordingError
 from gvo.frontend.descriptor import as_stereo
@@ -119,7 +108,7 @@ class _Drive:
             result = self._odometry.track(frame)
         config, offsets = self._config, trace.find("rig.offsets")
         row_px = offsets.get("row_px", 0.0)
-        measured = explain_measured(trace, config, row_px)
+        measured = steps.explain_measured(trace, config, row_px)
         n_chain = len(chain := registrations_of(trace.before("odometry.step")))
         reference_ns = chain[-1].reference_ns if chain else None
         tried = chain[-1].attempts if chain else []
@@ -137,14 +126,14 @@ class _Drive:
             offset_px=offsets.get("disparity_px", 0.0),
             row_offset_px=row_px,
             readout_ms=offsets.get("readout_ms", 0.0),
-            row_motion_px=explain_rows(last),
-            keypoints=explain_keypoints(trace),
+            row_motion_px=steps.explain_rows(last),
+            keypoints=steps.explain_keypoints(trace),
             measured=measured,
-            depth_pixels=explain_depth_pixels(frame, config.depth),
-            subpixel=explain_subpixel(trace, frame, measured, config.stereo, row_px),
-            matches=explain_matches(last, config),
-            consensus=explain_consensus(last, self._camera, config),
-            refinement=explain_refinement(last, self._camera, config),
+            depth_pixels=steps.explain_depth_pixels(frame, config.depth),
+            subpixel=steps.explain_subpixel(trace, frame, measured, config.stereo, row_px),
+            matches=steps.explain_matches(last, config),
+            consensus=steps.explain_consensus(last, self._camera, config),
+            refinement=steps.explain_refinement(last, self._camera, config),
             attempt=last,
             attempts=tuple(line for each in chain for line in describe(each, self._indices)),
             links=tuple(self._links(registrations_of(trace)[n_chain:], scores, result)),
@@ -156,11 +145,11 @@ class _Drive:
         """Tell what each earlier frame contributed."""
         registrations = {each.reference_ns: each.result for each in tried}
         keyframes = {link.reference_ns: link for link in result.links if link.kind == "keyframe"}
-        steps = [link for link in result.links if link.kind in ("step", "standstill")]
-        others = sorted({*scores} - {link.reference_ns for link in steps} | {*registrations})
+        before = [link for link in result.links if link.kind in ("step", "standstill")]
+        others = sorted({*scores} - {link.reference_ns for link in before} | {*registrations})
         refusals = {each.reference_id: each.reason for each in reversed(result.causal.rejected)}
         for ns, link, registration in [
-            *((link.reference_ns, link, result.registration) for link in steps),
+            *((link.reference_ns, link, result.registration) for link in before),
             *((ns, keyframes.get(ns), registrations.get(ns)) for ns in others),
             *((link.reference_ns, link, None) for link in result.links if link.kind == "depth"),
         ]:

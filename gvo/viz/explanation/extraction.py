@@ -66,8 +66,7 @@ def draw_keypoints(explanation: FrameExplanation) -> Picture:
     first.plot(*keypoints.pixels.T, ".", color="#CCCCCC", markersize=3.0)
     shown = keypoints.pixels[keypoints.are_kept]
     first.plot(*shown.T, "o", color=KEPT, markersize=5.0, markerfacecolor="none")
-    cell_px = _IMAGE_PX / (1 if stacked else 2) * size / image.shape[1]
-    _draw_cells(second, kept, detected, size, image.shape, has_numbers=cell_px >= _MIN_CELL_PX)
+    _draw_cells(second, kept, detected, size, image.shape)
     return sheet.picture()
 
 
@@ -79,15 +78,10 @@ def _per_cell(pixels: FloatArray, size: int, shape: tuple[int, ...]) -> IntArray
 
 
 def _draw_cells(
-    axes: Axes,
-    kept: IntArray,
-    detected: IntArray,
-    size: int,
-    shape: tuple[int, ...],
-    *,
-    has_numbers: bool,
+    axes: Axes, kept: IntArray, detected: IntArray, size: int, shape: tuple[int, ...]
 ) -> None:
     (rows, columns), (height, width) = kept.shape, shape
+    has_numbers = _IMAGE_PX / (1 if is_wide(shape) else 2) * size / width >= _MIN_CELL_PX
     edges = (-0.5, columns * size - 0.5, rows * size - 0.5, -0.5)
     title = "kept / detected in each cell" if has_numbers else "kept in each cell (darker: more)"
     vmax = max(2 * int(kept.max()), 1)
@@ -358,3 +352,8 @@ def _draw_curve(axes: Axes, step: Step) -> None:
     axes.set_ylim(0.0, 1.4 * float(ssd.max()))
     labels = "disparity [px]", "squared difference [grey²]"
     finish_axes(axes, *labels, loc="upper center", ncols=2)
+
+
+OF_STEREO = draw_stereo, draw_subpixel
+OF_DEPTH = draw_depth, draw_depth_keypoints
+"""What is drawn of the frame between its keypoints and the histograms, by sensor."""

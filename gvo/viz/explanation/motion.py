@@ -464,3 +464,7 @@ def _links_caption(explanation: FrameExplanation) -> str:
         elif link.reason and link.kind != "not linked":
             text += f"\nFrame {link.frame}: {link.reason}."
     return text
+
+
+DRAWERS = draw_matches, draw_consensus, draw_residuals, draw_pose, draw_links
+"""In the order of the steps."""

@@ -115,12 +115,8 @@ class Sheet:
             len(pixels) - round(height)
             for height in (self._title.get_window_extent().y0, self._footer.bbox.y1)
         )
-        return Picture(
-            name=self._name,
-            caption=self._caption,
-            png=_encode(pixels),
-            panels_png=_encode(pixels[top:bottom]),
-        )
+        png, panels_png = _encode(pixels), _encode(pixels[top:bottom])
+        return Picture(name=self._name, caption=self._caption, png=png, panels_png=panels_png)
 
 
 def _encode(pixels: ImageArray) -> bytes:
@@ -176,13 +172,7 @@ def show_image(axes: Axes, image: Any, title: str = "", **options: Any) -> None:
     axes.set_title(title, fontsize=_FONT_SIZE, loc="left")
 
 
-def finish_axes(
-    axes: Axes,
-    x_label: str,
-    y_label: str,
-    title: str = "",
-    **legend: Any,  # noqa: ANN401 - matplotlib's
-) -> None:
+def finish_axes(axes: Axes, x_label: str, y_label: str, title: str = "", **legend: Any) -> None:  # noqa: ANN401
     """Label axes, with a grid and a legend."""
     axes.set(xlabel=x_label, ylabel=y_label)
     axes.set_title(title, fontsize=_FONT_SIZE, loc="left")
@@ -199,12 +189,7 @@ def join_images(first: ImageArray, second: ImageArray) -> tuple[ImageArray, Floa
     return np.concatenate([first, second], axis=axis), shift
 
 
-def draw_segments(
-    axes: Axes,
-    starts: FloatArray,
-    ends: FloatArray,
-    **options: Any,  # noqa: ANN401 - matplotlib's
-) -> Any:  # noqa: ANN401
+def draw_segments(axes: Axes, starts: FloatArray, ends: FloatArray, **options: Any) -> Any:  # noqa: ANN401
     """Draw lines between pixels (n, 2) and return the collection."""
     lines = LineCollection(list(np.stack([starts, ends], axis=1)), **{"linewidths": 1.0, **options})
     axes.add_collection(lines, autolim=False)

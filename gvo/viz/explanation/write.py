@@ -15,22 +15,7 @@ from gvo.diagnostics.explain.steps import has_prior
 from gvo.diagnostics.explain.values import FrameExplanation, Sorting, Step
 from gvo.errors import ConfigurationError, write_faults
 from gvo.types import ConstantError, StereoFrame
-from gvo.viz.explanation.extraction import (
-    budget_of,
-    draw_depth,
-    draw_depth_keypoints,
-    draw_histograms,
-    draw_keypoints,
-    draw_stereo,
-    draw_subpixel,
-)
-from gvo.viz.explanation.motion import (
-    draw_consensus,
-    draw_links,
-    draw_matches,
-    draw_pose,
-    draw_residuals,
-)
+from gvo.viz.explanation import extraction, motion
 from gvo.viz.explanation.sheet import TITLES, Picture
 from gvo.viz.report.page import write_page
 
@@ -76,11 +61,8 @@ def write_explanation(explanation: FrameExplanation, out: Path) -> list[Path]:
 def draw_pictures(explanation: FrameExplanation) -> list[Picture]:
     """Draw the steps that were reached, in order; say of the others why not."""
     is_stereo = isinstance(explanation.frame, StereoFrame)
-    of_sensor = (draw_stereo, draw_subpixel) if is_stereo else (draw_depth, draw_depth_keypoints)
-    drawers = (
-        *(draw_keypoints, *of_sensor, draw_histograms),
-        *(draw_matches, draw_consensus, draw_residuals, draw_pose, draw_links),
-    )
+    of_sensor = extraction.OF_STEREO if is_stereo else extraction.OF_DEPTH
+    drawers = extraction.draw_keypoints, *of_sensor, extraction.draw_histograms, *motion.DRAWERS
     return [draw(explanation) for draw in drawers]
 
 
@@ -114,7 +96,7 @@ def explanation_json(explanation: FrameExplanation) -> dict[str, Any]:
     """
     result, keypoints = explanation.result, explanation.keypoints
     measured, is_stereo = _count(explanation.measured), isinstance(explanation.frame, StereoFrame)
-    budget, cell_size_px = budget_of(explanation.config)
+    budget, cell_size_px = extraction.budget_of(explanation.config)
     return {
         "recording": explanation.recording,
         "frame": explanation.index,

@@ -21,37 +21,17 @@ from gvo.trajectory.evaluation import (
     chi2_bound,
 )
 from gvo.types import FloatArray
+from gvo.viz import palette
 from gvo.viz.measures import Comparison, Drift, chi2_density, drift, drift_lengths
-from gvo.viz.palette import (
-    COUNTS,
-    ESTIMATES,
-    HATCHES,
-    LINKS,
-    REFUSED,
-    STAGES,
-    STATUSES,
-    Style,
-    styles_of,
-)
+from gvo.viz.palette import Style, styles_of
 from gvo.viz.plots import elapsed, plain
-from gvo.viz.report.sheets import (
-    N_COLUMNS,
-    WIDE,
-    Plot,
-    arrange,
-    columns_of,
-    draw_curve,
-    fit_left,
-    kept_of_curve,
-    kept_of_dots,
-    plain_decades,
-    time_axes,
-)
+from gvo.viz.report import sheets
+from gvo.viz.report.sheets import WIDE, Plot, arrange
 
 _ROW_HEIGHT = 2.1
 _N_COLUMNS = 350
 _SIGMAS = 3.0
-_RAW = Style(color=ESTIMATES["raw"], linewidth=1.1, zorder=3.0)
+_RAW = Style(color=palette.ESTIMATES["raw"], linewidth=1.1, zorder=3.0)
 _ALIGNED = {
     "none": "without alignment",
     "origin": "with the first poses aligned",
@@ -115,9 +95,9 @@ def _curves(
     for c, style in zip(comparisons, styles_of(c.name for c in comparisons), strict=True):
         x, seconds = abscissa(c), c.reference.stamps_ns / 1e9
         text = f"{c.name} (RMSE {c.ate_m:.3g} m)"
-        draw_curve(rows[0], x, c.errors_m, style, seconds=seconds, label=text)
+        sheets.draw_curve(rows[0], x, c.errors_m, style, seconds=seconds, label=text)
         if c.errors_rad is not None:
-            draw_curve(rows[1], x, np.rad2deg(c.errors_rad), style, seconds=seconds)
+            sheets.draw_curve(rows[1], x, np.rad2deg(c.errors_rad), style, seconds=seconds)
     rows[0].set_ylabel("position error [m]")
     if has_rotations:
         rows[1].set_ylabel("rotation error [deg]")
@@ -218,20 +198,20 @@ def _bands(item: Consistency, first_ns: int) -> Figure:
         factor = 1.0 if unit == "m" else float(np.rad2deg(1.0))
         _draw_band(panel, x, _SIGMAS * factor * item.sigmas[:, index])
         y = factor * item.errors[:, index]
-        draw_curve(panel, x, y, _RAW, label=item.name, n_columns=_N_COLUMNS)
+        sheets.draw_curve(panel, x, y, _RAW, label=item.name, n_columns=_N_COLUMNS)
         kind = "position" if unit == "m" else "rotation"
         panel.set_ylabel(f"{kind} {letter} [{unit}]")
     for panel in panels[-1]:
         panel.set_xlabel("elapsed [s]")
     arrange(figure, panels[0, 0])
     figure.subplots_adjust(wspace=0.4, hspace=0.1)
-    fit_left(figure)
+    sheets.fit_left(figure)
     figure.align_ylabels()
     return figure
 
 
 def _draw_band(axes: Any, x: FloatArray, reach: FloatArray) -> None:  # noqa: ANN401
-    kept = kept_of_curve(x, reach, n_columns=_N_COLUMNS)
+    kept = sheets.kept_of_curve(x, reach, n_columns=_N_COLUMNS)
     x, reach = x[kept], reach[kept]
     label = "\u00b13 sigma"
     if len(x) == 1:  # a band of one pose has no area
@@ -254,7 +234,7 @@ def status_plot(frames: FrameTable) -> Plot:
 
 def _ribbon(frames: FrameTable) -> Figure:
     counts = Counter(frames.statuses)
-    names = [*(s for s in STATUSES if counts[s]), *(s for s in counts if s not in STATUSES)]
+    names = [name for name in dict.fromkeys([*palette.STATUSES, *counts]) if counts[name]]
     figure = Figure(figsize=(WIDE, 0.85 + 0.32 * len(names)))
     axes = figure.subplots()
     x = elapsed(frames.stamps_ns, int(frames.stamps_ns[0]))
@@ -263,9 +243,9 @@ def _ribbon(frames: FrameTable) -> Figure:
         axes.broken_barh(
             _spans(x, statuses == name),
             (row - 0.4, 0.8),
-            facecolor=STATUSES.get(name, _UNKNOWN),
-            hatch=HATCHES.get(name, ""),
-            edgecolor="black" if HATCHES.get(name) else "none",
+            facecolor=palette.STATUSES.get(name, _UNKNOWN),
+            hatch=palette.HATCHES.get(name, ""),
+            edgecolor="black" if palette.HATCHES.get(name) else "none",
             linewidth=0.0,
         )
     axes.set_yticks(range(len(names)), [f"{name}: {counts[name]}" for name in names])
@@ -283,7 +263,7 @@ def _spans(x: FloatArray, is_there: Any) -> list[tuple[float, float]]:  # noqa: 
     step = float(np.median(np.diff(x))) if len(x) > 1 else extent
     n_columns = max(1, min(_N_RIBBON, round(extent / step) + 1))
     marks = np.zeros(n_columns + 2, dtype=np.int64)
-    marks[1 + columns_of(x, n_columns)[is_there]] = 1
+    marks[1 + sheets.columns_of(x, n_columns)[is_there]] = 1
     edges = np.flatnonzero(np.diff(marks)).reshape(-1, 2)
     width = (extent + step) / n_columns if len(x) > 1 else 1.0
     starts, widths = x[0] + edges[:, 0] * width, (edges[:, 1] - edges[:, 0]) * width
@@ -292,17 +272,17 @@ def _spans(x: FloatArray, is_there: Any) -> list[tuple[float, float]]:  # noqa: 
 
 def count_plot(frames: FrameTable) -> Plot:
     """Return keypoints, points, matches and inliers per frame."""
-    present = {n: frames.counts[n] for n in COUNTS if n in frames.counts}
+    present = {n: frames.counts[n] for n in palette.COUNTS if n in frames.counts}
     has_pose = np.array([status != "skipped" for status in frames.statuses], dtype=np.bool_)
     if not present or not np.any(has_pose):
         return Plot(slug="counts", text="Not drawn: the run has no counts; its edges were given.")
-    figure, axes = time_axes(3.0, "number per frame [-]")
+    figure, axes = sheets.time_axes(3.0, "number per frame [-]")
     x = elapsed(frames.stamps_ns, int(frames.stamps_ns[0]))
     for name, counts in present.items():
         y = np.where(has_pose, counts, np.nan).astype(np.float64)
         if name in ("matches", "inliers"):
             y[np.argmax(has_pose)] = np.nan  # nothing precedes the first frame
-        draw_curve(axes, x, y, Style(color=COUNTS[name]), label=name)
+        sheets.draw_curve(axes, x, y, Style(color=palette.COUNTS[name]), label=name)
     axes.set_ylim(bottom=0.0)
     arrange(figure, axes)
     text = (
@@ -333,7 +313,7 @@ def timing_plot(timings: TimingTable | None) -> Plot:
     table = np.nan_to_num(np.stack(list(timings.stages_ms.values())))
     total = table.sum(axis=0)
     median, slow = np.quantile(total, [0.5, 0.95])
-    figure, axes = time_axes(3.2, "milliseconds per frame [ms]")
+    figure, axes = sheets.time_axes(3.2, "milliseconds per frame [ms]")
     _stack(axes, timings, table)
     axes.axhline(median, color="black", lw=1.0, label=f"median {median:.1f}")
     axes.axhline(slow, color="black", lw=1.0, ls=":", label=f"95 %: {slow:.1f}")
@@ -350,13 +330,13 @@ def timing_plot(timings: TimingTable | None) -> Plot:
 
 def _stack(axes: Axes, timings: TimingTable, table: FloatArray) -> None:
     x = elapsed(timings.stamps_ns, int(timings.stamps_ns[0]))
-    kept = kept_of_curve(x, table.sum(axis=0), n_columns=N_COLUMNS // 2)
+    kept = sheets.kept_of_curve(x, table.sum(axis=0), n_columns=sheets.N_COLUMNS // 2)
     at, drawn = x[kept], table[:, kept]
     if len(x) == 1:  # a stack of one frame has no width
         at, drawn = np.array([-0.5, 0.5]), np.repeat(table, 2, axis=1)
     stages = timings.stages_ms
     labels = [f"{name} ({np.median(row):.1f})" for name, row in zip(stages, table, strict=True)]
-    colours = [STAGES.get(name, _UNKNOWN) for name in stages]
+    colours = [palette.STAGES.get(name, _UNKNOWN) for name in stages]
     axes.stackplot(at, drawn, labels=labels, colors=colours, step="mid", lw=0)
 
 
@@ -415,7 +395,7 @@ def _is_free(edges: EdgeTable) -> Any:  # noqa: ANN401
 
 def _mean_words(edges: EdgeTable, bound: float) -> str:
     is_free, parts = _is_free(edges), []
-    for kind in LINKS:
+    for kind in palette.LINKS:
         values = edges.chi2[is_free & (edges.kinds == kind)]
         if len(values) > 0:
             above = 100.0 * float(np.mean(values > bound))
@@ -424,20 +404,20 @@ def _mean_words(edges: EdgeTable, bound: float) -> str:
 
 
 def _dots(edges: EdgeTable, first_ns: int, bound: float) -> Figure:
-    figure, axes = time_axes(3.2, "chi-square [-]")
+    figure, axes = sheets.time_axes(3.2, "chi-square [-]")
     is_known = np.isfinite(edges.chi2)
     x = elapsed(edges.stamps_ns, first_ns)
     y = np.maximum(np.where(is_known, edges.chi2, 1.0), _FLOOR)
-    for kind, colour in LINKS.items():
+    for kind, colour in palette.LINKS.items():
         chosen = np.flatnonzero(is_known & edges.is_accepted & (edges.kinds == kind))
         _scatter(axes, x[chosen], y[chosen], kind, ms=3.0, marker=_MARKERS[kind], color=colour)
     refused = np.flatnonzero(is_known & ~edges.is_accepted)
     label = f"refused ({len(refused)})"
-    _scatter(axes, x[refused], y[refused], label, ms=6.0, marker="x", color=REFUSED)
+    _scatter(axes, x[refused], y[refused], label, ms=6.0, marker="x", color=palette.REFUSED)
     axes.axhline(N_DOF, color="black", lw=1.0, ls=":", label="6: mean of 6 dof")
     axes.axhline(bound, color="black", lw=1.0, ls="--", label=f"{bound:.1f}: 95 % bound of 6 dof")
     axes.set_yscale("log")
-    plain_decades(axes.yaxis)
+    sheets.plain_decades(axes.yaxis)
     axes.set_ylim(0.7 * _FLOOR, max(40.0, 2.0 * float(y.max())))
     arrange(figure, axes)
     return figure
@@ -445,7 +425,7 @@ def _dots(edges: EdgeTable, first_ns: int, bound: float) -> Figure:
 
 def _scatter(axes: Any, x: FloatArray, y: FloatArray, label: str, **looks: Any) -> None:  # noqa: ANN401
     if len(x) > 0:
-        kept = kept_of_dots(x, np.log10(y), n_columns=_N_DOT_COLUMNS, n_rows=_N_DOT_ROWS)
+        kept = sheets.kept_of_dots(x, np.log10(y), n_columns=_N_DOT_COLUMNS, n_rows=_N_DOT_ROWS)
         axes.plot(x[kept], y[kept], linestyle="", markeredgewidth=0.8, label=label, **looks)
 
 
@@ -453,7 +433,7 @@ def _histogram(edges: EdgeTable, bound: float) -> Figure:
     figure = Figure(figsize=(WIDE, 3.0))
     axes: Any = figure.subplots()
     is_free = _is_free(edges)
-    for kind in LINKS:
+    for kind in palette.LINKS:
         _draw_bars(axes, kind, edges.chi2[is_free & (edges.kinds == kind)])
     grid = np.linspace(*_DECADES, 400)
     # density over the decimal logarithm
@@ -476,7 +456,7 @@ def _draw_bars(axes: Any, kind: str, values: FloatArray) -> None:  # noqa: ANN40
         np.linspace(*_DECADES, _N_BINS + 1),
         density=True,
         histtype="stepfilled",
-        facecolor=LINKS[kind],
+        facecolor=palette.LINKS[kind],
         edgecolor="black",
         alpha=0.5,
         hatch=_HATCHES[kind],

@@ -18,14 +18,7 @@ from gvo.trajectory.evaluation import Evaluation, consistency, evaluation_table,
 from gvo.trajectory.trajectory import Trajectory
 from gvo.viz.measures import Comparison, compare
 from gvo.viz.plots import elapsed, evenly
-from gvo.viz.report.page import (
-    configuration_html,
-    facts_html,
-    list_html,
-    plots_html,
-    table_html,
-    write_page,
-)
+from gvo.viz.report import page
 from gvo.viz.report.paths import Line, World, lines_of, loop_lines, path_plots
 from gvo.viz.report.plots import (
     count_plot,
@@ -114,8 +107,8 @@ def write_comparison_report(
         if path is not None:
             names = ", ".join(trajectories)
             head = _comparison_head(names, truth, evaluations, align)
-            body = [*head, *plots_html(sheets, lines, world)]
-            write_page(Path(path), f"Comparison: {names}", body)
+            body = [*head, *page.plots_html(sheets, lines, world)]
+            page.write_page(Path(path), f"Comparison: {names}", body)
         if plots is not None:
             write_plots(sheets, Path(plots))
 
@@ -124,8 +117,8 @@ def _comparison_head(
     names: str, truth: Trajectory, evaluations: Sequence[Evaluation], align: AlignMode
 ) -> list[str]:
     facts = {"Estimates": names, "Poses of the reference": str(len(truth)), "Alignment": align}
-    table = table_html(*evaluation_table(evaluations))
-    return ["<h1>Comparison of trajectories</h1>", facts_html(facts), table]
+    table = page.table_html(*evaluation_table(evaluations))
+    return ["<h1>Comparison of trajectories</h1>", page.facts_html(facts), table]
 
 
 def truth_around(truth: Trajectory, parts: Sequence[Trajectory]) -> Trajectory:
@@ -172,8 +165,8 @@ def write_run_report(
             *edge_plots(record.edges, _first_ns(record)),
         ]
         # The page first: it must exist even if the folder cannot be written.
-        body = [*_head(record), *plots_html(sheets, lines, world), *_tail(record)]
-        write_page(Path(path), f"gvo: {record.name}", body)
+        body = [*_head(record), *page.plots_html(sheets, lines, world), *_tail(record)]
+        page.write_page(Path(path), f"gvo: {record.name}", body)
         if plots is not None:
             write_plots(sheets, Path(plots))
 
@@ -253,13 +246,15 @@ def _head(record: RunRecord) -> list[str]:
             '<p class="absent">This run has not ended: it is running or was interrupted. '
             "The report shows what was written so far.</p>"
         )
-    parts.append(list_html("Warnings", map(str, summary.get("warnings", ())), kind="warnings"))
-    parts.append(facts_html(_facts(record)))
+    parts.append(page.list_html("Warnings", map(str, summary.get("warnings", ())), kind="warnings"))
+    parts.append(page.facts_html(_facts(record)))
     if summary.get("errors"):
         header = ("estimate", "poses", *_ERROR_COLUMNS.values())
-        parts.append(table_html(header, map(_error_row, summary["errors"])))
+        parts.append(page.table_html(header, map(_error_row, summary["errors"])))
     if summary.get("covariances"):
-        parts.append(table_html([*_NEES_COLUMNS.values()], map(_nees_row, summary["covariances"])))
+        parts.append(
+            page.table_html([*_NEES_COLUMNS.values()], map(_nees_row, summary["covariances"]))
+        )
         parts.append(f'<p class="note">{_NEES_NOTE}</p>')
     return [part for part in parts if part]
 
@@ -268,8 +263,8 @@ def _tail(record: RunRecord) -> list[str]:
     summary = record.summary
     return [
         *_loops(record.loops, _first_ns(record)),
-        list_html("Decisions", map(str, summary.get("decisions", ()))),
-        configuration_html(summary.get("configuration", {}), Config().model_dump()),
+        page.list_html("Decisions", map(str, summary.get("decisions", ()))),
+        page.configuration_html(summary.get("configuration", {}), Config().model_dump()),
     ]
 
 
@@ -294,7 +289,7 @@ def _loops(loops: LoopTable | None, first_ns: int) -> list[str]:
     )
     return [
         f'<section id="loops">\n<h2>Loops</h2>\n<p class="note">{note}</p>\n'
-        f"{table_html(_LOOP_COLUMNS, rows)}</section>"
+        f"{page.table_html(_LOOP_COLUMNS, rows)}</section>"
     ]
 
 
