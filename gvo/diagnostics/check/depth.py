@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -55,8 +56,7 @@ class Misregistration:
     rms_px: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Strips:
+class _Strips(NamedTuple):
     """Strength of colour edges along one axis around steps of depth.
 
     `values` (n, 2 * reach + 1) are NaN outside the image; `offsets` (n,) are from its middle.
@@ -179,14 +179,11 @@ def _cut(edges: NDArray[np.float32], steps: BoolArray, rng: np.random.Generator)
     reach = _REACH_PX + math.ceil(max(_ZOOMS) * width / 2)
     padded = np.pad(edges, ((0, 0), (reach, reach)), constant_values=np.nan)
     values = padded[rows[:, np.newaxis], columns[:, np.newaxis] + np.arange(2 * reach + 1)]
-    return _Strips(values=values, offsets=columns - 0.5 * (width - 1))
+    return _Strips(values, columns - 0.5 * (width - 1))
 
 
 def _joined(parts: Sequence[_Strips]) -> _Strips:
-    return _Strips(
-        values=np.concatenate([part.values for part in parts]),
-        offsets=np.concatenate([part.offsets for part in parts]),
-    )
+    return _Strips(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _score(pair: _Axis, zoom: float) -> FloatArray:

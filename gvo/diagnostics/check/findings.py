@@ -251,7 +251,7 @@ def format_check(result: CheckResult) -> str:
     """
     head = [finding.value_text for finding in takewhile(_is_info, result.findings)]
     findings = list(_merged(result.findings[len(head) :]))
-    rows = [_row(finding) for finding in findings]
+    rows = [(f.name, f.value_text, f.threshold, f.verdict, f.fix) for f in findings]
     # Infos, however long, do not widen the columns of the others.
     wide = [
         (row[0], "", "", "", "") if _is_info(finding) else row
@@ -291,10 +291,6 @@ def _joined(first: Finding, second: Finding) -> Finding:
     (one, _, what), (other, *_) = first.name.partition(": "), second.name.partition(": ")
     values = dict.fromkeys((first.value_text, second.value_text))
     return replace(first, name=f"{one}, {other}: {what}", text=" | ".join(values))
-
-
-def _row(finding: Finding) -> tuple[str, ...]:
-    return (finding.name, finding.value_text, finding.threshold, finding.verdict, finding.fix)
 
 
 def _sum_up(result: CheckResult) -> str:

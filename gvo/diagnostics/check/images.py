@@ -70,7 +70,7 @@ def check_images(samples: Sequence[Sample], config: Config) -> Iterator[Finding]
         yield from _check_exposure(name, images, config.check)
         yield from _check_sharpness(name, images, config.check)
         yield from _check_texture(name, images, pairs, config)
-        yield from _check_transfer(name, images, pairs, config.check)
+        yield from _check_transfer(name, images, pairs, config)
     if is_stereo:
         yield _compare_exposures([_grey_images(sample.first) for sample in usable], config.check)
 
@@ -203,10 +203,7 @@ def _check_sharpness(
 
 
 def _check_texture(
-    name: str,
-    images: Sequence[ImageArray],
-    pairs: Sequence[tuple[ImageArray, ImageArray]],
-    config: Config,
+    name: str, images: Sequence[ImageArray], pairs: Sequence[tuple[ImageArray, ...]], config: Config
 ) -> Iterator[Finding]:
     check = config.check
     counts = [len(detect_corners(image, config.klt)) for image in images]
@@ -234,20 +231,17 @@ def _check_texture(
 
 
 def _check_transfer(
-    name: str,
-    images: Sequence[ImageArray],
-    pairs: Sequence[tuple[ImageArray, ImageArray]],
-    check: CheckConfig,
+    name: str, images: Sequence[ImageArray], pairs: Sequence[tuple[ImageArray, ...]], config: Config
 ) -> Iterator[Finding]:
     if pairs:
-        yield check_frozen(name, pairs, check)
+        yield check_frozen(name, pairs, config.check)
     torn = np.array([n_torn_rows(image) for image in images])
     # Rectification leaves a border without pixels, the same in all images.
     limit = max(_MIN_TORN_ROWS, _MIN_TORN_SHARE * images[0].shape[0])
     n_torn = int(np.count_nonzero(torn - torn.min() > limit))
     fix = "transfers break off: lower rate or size, another cable or port"
     how = " end in rows of one value"
-    yield lost(f"{name}: torn images", n_torn, len(images), check, fix, how)
+    yield lost(f"{name}: torn images", n_torn, len(images), config.check, fix, how)
 
 
 def _compare_exposures(pairs: Sequence[tuple[ImageArray, ...]], check: CheckConfig) -> Finding:

@@ -65,7 +65,7 @@ def check_recording(
     """
     config = config or Config()
     found = survey(source, config, n_samples=n_samples or config.check.n_samples)
-    info = source.info
+    info, stamps_ns = source.info, found.streams[0].stamps_ns
     camera = _find_camera(info)
     findings = [
         *_describe(info, found),
@@ -85,11 +85,7 @@ def check_recording(
         findings.append(_check_changes(changes))
     if transforms is not None:
         findings += check_frame_tree(
-            transforms,
-            info.frame_id,
-            found.streams[0].stamps_ns,
-            base_frame=base_frame,
-            check=config.check,
+            transforms, info.frame_id, stamps_ns, base_frame=base_frame, check=config.check
         )
     return CheckResult(recording=info.name, findings=tuple(findings))
 

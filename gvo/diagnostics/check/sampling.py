@@ -98,12 +98,9 @@ def survey(source: Source, config: Config, *, n_samples: int) -> Survey:
     if n_pairs == 0 and all(len(stamps) for stamps in pass_.stamps):
         pass_ = _Pass(source, config.sync, n_samples)
         pass_.run(_WIDE_LIMIT_MS)
-    return Survey(
-        streams=(pass_.stream(0), pass_.stream(1)),
-        n_pairs=n_pairs,
-        samples=_load(source.info, config, pass_.chosen),
-        damage=pass_.damage,
-    )
+    streams = pass_.stream(0), pass_.stream(1)
+    samples = _load(source.info, config, pass_.chosen)
+    return Survey(streams=streams, n_pairs=n_pairs, samples=samples, damage=pass_.damage)
 
 
 class _Pass:
