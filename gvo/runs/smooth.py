@@ -301,11 +301,9 @@ def _written(
         if on_written is not None:
             on_written()
         plot_trajectories(folder.path / PICTURE, truth if evaluations else None, estimates)
+    is_complete &= not fault
     return RunResult(
-        summary=summary,
-        evaluations=evaluations,
-        is_complete=is_complete and not fault,
-        warnings=tuple(warnings),
+        summary=summary, evaluations=evaluations, is_complete=is_complete, warnings=tuple(warnings)
     )
 
 

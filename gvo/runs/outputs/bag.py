@@ -66,18 +66,7 @@ from gvo.io.convert.bag_messages import (
     write_transforms,
 )
 from gvo.io.run_folder.line_file import PartFile
-from gvo.runs.outputs.bag_messages import (
-    CLOUD_TYPE,
-    DIAGNOSTICS_TYPE,
-    MARKER_TYPE,
-    ODOMETRY_TYPE,
-    PATH_TYPE,
-    write_diagnostics,
-    write_lines,
-    write_odometry,
-    write_path,
-    write_points,
-)
+from gvo.runs.outputs import bag_messages as messages
 from gvo.runs.outputs.frames import GLOBAL, ODOM, RunFrames, StampedPose, Track, twist_between
 from gvo.types import (
     BoolArray,
@@ -103,14 +92,14 @@ TOPICS: Final = {
     "/tf": TF_TYPE,
     "/tf_static": TF_TYPE,
     **{
-        f"/gvo/{name}/odometry": ODOMETRY_TYPE
+        f"/gvo/{name}/odometry": messages.ODOMETRY_TYPE
         for name in ("raw", "causal", ODOM, "smoothed", GLOBAL)
     },
-    **{f"/gvo/{name}/path": PATH_TYPE for name in ("raw", "smoothed", GLOBAL)},
-    "/gvo/loops": MARKER_TYPE,
-    _POINTS: CLOUD_TYPE,
+    **{f"/gvo/{name}/path": messages.PATH_TYPE for name in ("raw", "smoothed", GLOBAL)},
+    "/gvo/loops": messages.MARKER_TYPE,
+    _POINTS: messages.CLOUD_TYPE,
     _PICTURE: COMPRESSED_TYPE,
-    "/diagnostics": DIAGNOSTICS_TYPE,
+    "/diagnostics": messages.DIAGNOSTICS_TYPE,
 }
 """All topics, with their types."""
 
@@ -193,7 +182,9 @@ class RunMessages:
         if self._first_ns is None:
             return
         header = Header(frame.stamp_ns, self._frames.camera)
-        write_diagnostics(self._writer, header, Status.SKIPPED, f"skipped: {frame.reason}", {})
+        messages.write_diagnostics(
+            self._writer, header, Status.SKIPPED, f"skipped: {frame.reason}", {}
+        )
 
     def _begin(self, stamp_ns: int) -> None:
         """Note the stamp of a frame; at the first, write the static transforms."""
@@ -220,13 +211,13 @@ class RunMessages:
         estimate = replace(causal, T_world_frame=self._T_odom_base)
         twist = twist_between(estimate, previous, self._step_covariance(result, result.raw))
         names = frames.odom, frames.base_by(ODOM)
-        write_odometry(self._writer, f"/gvo/{ODOM}/odometry", estimate, names, twist)
+        messages.write_odometry(self._writer, f"/gvo/{ODOM}/odometry", estimate, names, twist)
 
     def _write_loops(self, name: str, track: Track, loops: Iterable[Loop]) -> None:
         segments = track.segments(loops)
         if len(segments) > 0:
             header, number = Header(self._newest_ns, self._frames.world), next(self._numbers)
-            write_lines(self._writer, "/gvo/loops", header, segments, name=name, number=number)
+            messages.write_lines(self._writer, header, segments, name=name, number=number)
 
     def _step_covariance(self, result: FrameResult, raw: Estimate) -> FloatArray | None:
         """Return the covariance (6, 6) of the last step of the raw chain, where it is known.
@@ -247,7 +238,7 @@ class RunMessages:
         previous: StampedPose | None,
         step_covariance: FloatArray | None = None,
     ) -> None:
-        write_odometry(
+        messages.write_odometry(
             self._writer,
             f"/gvo/{name}/odometry",
             estimate,
@@ -259,12 +250,12 @@ class RunMessages:
         """Write diagnostics, points and picture of a frame; the last two where they are wanted."""
         hardware = Header(frame.stamp_ns, self._frames.camera)
         text = " ".join(caption(result))
-        write_diagnostics(self._writer, hardware, result.status, text, _numbers(result))
+        messages.write_diagnostics(self._writer, hardware, result.status, text, _numbers(result))
         header = Header(frame.stamp_ns, self._frames.camera_by("causal"))
         image, found = image_of(frame), placed_matches(result)
         if self._writer.is_wanted(_POINTS):
             intensities = _grey_values(image, found.pixels_current)
-            write_points(self._writer, _POINTS, header, found, intensities)
+            messages.write_points(self._writer, _POINTS, header, found, intensities)
         if self._writer.is_wanted(_PICTURE):
             matches = found.pixels_reference, found.pixels_current, found.inliers
             picture = draw_matches(image, *matches, lines=caption(result))
@@ -283,7 +274,7 @@ class RunMessages:
         for name, track in self._tracks.items():
             topic = f"/gvo/{name}/path"
             if len(track) > 0 and self._writer.is_wanted(topic):
-                write_path(self._writer, topic, header, *track.poses(n_most))
+                messages.write_path(self._writer, topic, header, *track.poses(n_most))
 
 
 class RunBag(AbstractContextManager["RunBag"]):

@@ -25,11 +25,7 @@ _LINE_WIDTH_M = 0.03
 
 # Three bytes of padding: four-byte fields that start at multiples of four are read anywhere.
 _POINT: Final = np.dtype(
-    {
-        "names": ["x", "y", "z", "intensity", "inlier"],
-        "formats": ["<f4", "<f4", "<f4", "<f4", "u1"],
-        "itemsize": 20,
-    }
+    [*((name, "<f4") for name in ("x", "y", "z", "intensity")), ("inlier", "u1")], align=True
 )
 _UINT8, _FLOAT32 = 2, 7  # of sensor_msgs/PointField
 _LEVELS: Final = {
@@ -126,21 +122,13 @@ def write_path(
 
 
 def write_lines(
-    writer: MessageWriter,
-    topic: str,
-    header: Header,
-    segments: FloatArray,
-    *,
-    name: str,
-    number: int,
+    writer: MessageWriter, header: Header, segments: FloatArray, *, name: str, number: int
 ) -> None:
-    """Write lines as a `visualization_msgs/Marker`, in the colour of loops.
+    """Write the lines of loops as a `visualization_msgs/Marker` to `/gvo/loops`.
 
     Parameters
     ----------
     writer : MessageWriter
-    topic : str
-        Where to.
     header : Header
         Stamp, and the frame of the lines.
     segments : ndarray of float64, shape (n, 2, 3)
@@ -171,7 +159,7 @@ def write_lines(
         mesh_use_embedded_materials=False,
         **({} if writer.is_ros1 else _untextured(writer)),
     )
-    writer.write(topic, MARKER_TYPE, message, header.stamp_ns)
+    writer.write("/gvo/loops", MARKER_TYPE, message, header.stamp_ns)
 
 
 def _untextured(writer: MessageWriter) -> dict[str, object]:

@@ -91,7 +91,8 @@ class RunRerun(AbstractContextManager["RunRerun"]):
         self.path = Path(path)
         self._n_frames = 0
         self._is_open = True
-        _check_sdk()
+        if importlib.util.find_spec("rerun") is None:
+            raise missing_extra("--rerun needs rerun-sdk", "rerun")
         if self.path.suffix != SUFFIX:
             raise RecordingError(
                 f"{path}: expected a name ending in {SUFFIX}, got {self.path.name}"
@@ -167,8 +168,3 @@ class RunRerun(AbstractContextManager["RunRerun"]):
     def __exit__(self, *exception: object) -> None:
         """Close it."""
         self.close()
-
-
-def _check_sdk() -> None:
-    if importlib.util.find_spec("rerun") is None:
-        raise missing_extra("--rerun needs rerun-sdk", "rerun")

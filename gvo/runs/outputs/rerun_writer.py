@@ -133,16 +133,9 @@ def make_layout() -> rrb.Blueprint:
 
 def _scene() -> rrb.Spatial3DView:
     """Return the view of the world; points of keyframes and loops are those that came so far."""
-    so_far = rrb.VisibleTimeRanges(
-        [
-            rrb.VisibleTimeRange(
-                timeline,
-                start=rrb.TimeRangeBoundary.infinite(),
-                end=rrb.TimeRangeBoundary.cursor_relative(),
-            )
-            for timeline in (STAMP, FRAME)
-        ]
-    )
+    start, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
+    ranges = [rrb.VisibleTimeRange(name, start=start, end=now) for name in (STAMP, FRAME)]
+    so_far = rrb.VisibleTimeRanges(ranges)
     return rrb.Spatial3DView(origin="world", name="Scene", overrides={CLOUD: so_far, LOOPS: so_far})
 
 
