@@ -197,10 +197,5 @@ class _Table:
 
         n_missing = len(self._places) - len(self._rows)
         note = f"{n_missing} runs were not made: the batch was stopped" if n_missing else ""
-        write_batch_report(
-            folder / REPORT,
-            self.rows(),
-            title=Path(self.location).name,
-            note=note,
-            plots=self._plots,
-        )
+        page, title = folder / REPORT, Path(self.location).name
+        write_batch_report(page, self.rows(), title=title, note=note, plots=self._plots)

@@ -48,12 +48,8 @@ def work(task: Task, options: TaskOptions, topic: str, key: Any) -> BatchRow:  #
     from gvo.batch.tasks import run_task
 
     worker: Any = get_worker()
-    return run_task(
-        task,
-        options,
-        scratch=Path(worker.local_directory),
-        on_progress=_reporter(worker, topic, key),
-    )
+    scratch, report = Path(worker.local_directory), _reporter(worker, topic, key)
+    return run_task(task, options, scratch=scratch, on_progress=report)
 
 
 def _reporter(worker: Any, topic: str, key: Any) -> Callable[[Progress], None]:  # noqa: ANN401

@@ -20,7 +20,7 @@ from gvo.batch.tasks import BatchRow
 from gvo.io.run_folder.writer import REPORT
 from gvo.types import FloatArray
 from gvo.viz.report.page import facts_html, list_html, plots_html, write_page
-from gvo.viz.report.sheets import Plot, settings, write_plots
+from gvo.viz.report.sheets import settings, write_plots
 
 _MAX_LISTED = 20
 _SCHEMES = ("http", "https")
@@ -74,7 +74,10 @@ def write_batch_report(
     with settings(), warnings.catch_warnings():
         # the page takes its fonts from the reader's machine
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
-        sheets = _sheets(batch)
+        sheets = [(box_plot(batch), ""), *effect_sheets(batch)]
+        if batch.is_sweep:
+            sheets.append(front_sheet(batch))
+        # Each plot with the table below it.
         body = [
             *_head(batch, title, note),
             *(part for plot, table in sheets for part in (*plots_html([plot]), table)),
@@ -83,15 +86,6 @@ def write_batch_report(
         write_page(path, title, body)
         if plots is not None:
             write_plots([plot for plot, _ in sheets], plots)
-
-
-def _sheets(batch: Batch) -> list[tuple[Plot, str]]:
-    """Return the plots, each with the table below it."""
-    sheets = [(box_plot(batch), "")]
-    sheets += effect_sheets(batch)
-    if batch.is_sweep:
-        sheets.append(front_sheet(batch))
-    return sheets
 
 
 def _head(batch: Batch, title: str, note: str) -> list[str]:
@@ -228,7 +222,8 @@ def run_address(run: str, folder: Path) -> str:
     """
     if "://" in run:
         return run if urlsplit(run).scheme in _SCHEMES else ""
-    found = next((at for at in (f"{run}/{REPORT}", run) if _exists(folder / at)), None)
+    # Path.exists raises if the name is too long
+    found = next((at for at in (f"{run}/{REPORT}", run) if os.path.exists(folder / at)), None)  # noqa: PTH110
     if found is None:
         return ""
     path = Path(found)
@@ -236,7 +231,3 @@ def run_address(run: str, folder: Path) -> str:
         return path.as_uri()
     # the colon is encoded too: what is before it would be a scheme
     return quote(path.as_posix(), errors="surrogateescape")
-
-
-def _exists(path: Path) -> bool:
-    return os.path.exists(path)  # noqa: PTH110 - Path.exists raises if the name is too long
