@@ -273,7 +273,6 @@ class Engine:
         shares = sum(min(n_done / max(n_total, 1), 1.0) for n_done, n_total in running)
         # Runs found finished took no time.
         worked = state.n_done - state.n_found + shares
-        left_s = (
-            elapsed_s * (state.n_total - state.n_done - shares) / worked if worked > 0 else None
-        )
+        n_left = state.n_total - state.n_done - shares
+        left_s = elapsed_s * n_left / worked if worked > 0 else None
         return replace(state, frames_per_s=n_frames / elapsed_s, left_s=left_s, row=row)

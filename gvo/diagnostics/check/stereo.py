@@ -113,11 +113,9 @@ class FreeMatcher:
     def _pair(self, left: Features, right: Features, shape: tuple[int, ...]) -> IntArray:
         if len(left) == 0 or len(right) == 0:
             return np.zeros((0, 2), dtype=np.int64)
-        steps = right.keypoints[np.newaxis] - left.keypoints[:, np.newaxis]
+        apart = np.abs(right.keypoints[np.newaxis] - left.keypoints[:, np.newaxis])
         band = max(_MIN_ROW_BAND_PX, _ROW_SHARE * shape[0])
-        is_near = (np.abs(steps[:, :, 1]) <= band) & (
-            np.abs(steps[:, :, 0]) <= _COLUMN_SHARE * shape[1]
-        )
+        is_near = (apart[:, :, 1] <= band) & (apart[:, :, 0] <= _COLUMN_SHARE * shape[1])
         pairs = np.argwhere(is_near)
         distances = descriptor_distances(left.descriptors, right.descriptors, pairs)
         table = np.full(is_near.shape, 1.0)

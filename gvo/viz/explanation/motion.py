@@ -433,11 +433,8 @@ def _draw_link(axes: Axes, link: Step) -> None:
         chi2 = "" if link.chi2 is None else f", chi2 {link.chi2:.2f}"
         counts = f"{link.n_inliers} of {link.n_matches} inliers"
         answer = f"{counts}{chi2}, {'accepted' if link.is_accepted else 'refused'}"
-    for spine in axes.spines.values():
-        spine.set_edgecolor(
-            KEPT if link.is_accepted else BEFORE if link.kind == "not linked" else REFUSED
-        )
-        spine.set_linewidth(3)
+    colour = KEPT if link.is_accepted else BEFORE if link.kind == "not linked" else REFUSED
+    axes.spines[:].set(edgecolor=colour, linewidth=3)
     lines = [f"frame {link.frame}, {what[link.kind]}{overlap}", *textwrap.wrap(answer, 48)]
     axes.set_title("\n".join(lines), fontsize=8, loc="left")
 

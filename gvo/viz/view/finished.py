@@ -168,10 +168,9 @@ class FinishedPage:
         points = np.concatenate(positions)
         reach = max(0.1, float(np.linalg.norm(np.ptp(points, axis=0))))
         self.scene.set_camera(4, 3, 3.0, size_m=0.04 * reach)
-        lowest = points[np.argmin(points @ panels.UP[self.scene.up])]
-        self.scene.show_ground(
-            lowest - 0.02 * reach * panels.UP[self.scene.up], panels.grid_cell(0.1 * reach)
-        )
+        up = panels.UP[self.scene.up]
+        ground = points[np.argmin(points @ up)] - 0.02 * reach * up
+        self.scene.show_ground(ground, panels.grid_cell(0.1 * reach))
         self._view.look_down(points)
 
     def _rows(self, index: int, stamp_ns: int) -> dict[str, str]:

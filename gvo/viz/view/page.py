@@ -184,10 +184,8 @@ class Page:
         camera = self._player.source.info.camera
         depth = _depth_of(frame, camera)
         self.scene.set_camera(camera.width, camera.height, camera.fy, size_m=_CAMERA_SHARE * depth)
-        start = frame.T_world_frame[:3, 3]
-        self.scene.show_ground(
-            start - _GROUND_SHARE * depth * panels.UP["-y"], panels.grid_cell(0.1 * depth)
-        )
+        ground = frame.T_world_frame[:3, 3] - _GROUND_SHARE * depth * panels.UP["-y"]
+        self.scene.show_ground(ground, panels.grid_cell(0.1 * depth))
         self._view.look_along(frame.T_world_frame, _VIEW_SHARE * depth)
 
     def _draw_images(self, frame: FrameView) -> None:

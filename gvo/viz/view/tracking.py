@@ -245,9 +245,7 @@ def _draw_fault(camera: PinholeCamera, reason: str) -> ImageArray:
     """Return a dark picture that tells why there is no frame, BGR."""
     none = np.zeros((0, 2))
     dark = np.full((camera.height, camera.width), 40, dtype=np.uint8)
-    return draw_matches(
-        dark, none, none, np.zeros(0, dtype=np.bool_), lines=[f"no frame: {reason}"]
-    )
+    return draw_matches(dark, none, none, np.zeros(0, np.bool_), lines=[f"no frame: {reason}"])
 
 
 def _small_picture(image: ImageArray) -> ImageArray:
