@@ -6,7 +6,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import takewhile
+from itertools import pairwise, takewhile
 from typing import Any, Final
 
 import numpy as np
@@ -56,7 +56,6 @@ _LOOP: Final = np.dtype(
 class _Visit:
     """A place, and where odometry was when it was seen, in one of its worlds."""
 
-    number: int
     place: Any
     T_world_frame: FloatArray
     world: int
@@ -95,8 +94,8 @@ class LoopDetector:
     """Finds places again, and registers frames against them.
 
     Candidates come by appearance, the latest places apart. What is registered has to be seen in
-    most of the view. It is a loop when another one confirms it: two loops of neighbouring frames
-    and the odometry between them agree.
+    most of the view. It is a loop when another one confirms it: two loops of neighbouring frames,
+    or of a frame to neighbouring places, and the odometry between them agree.
 
     Where odometry was lost it goes on in another world, whose place among the others is not known
     until a loop tells: its first frames search all other places, whatever they look like.
@@ -130,7 +129,6 @@ class LoopDetector:
         self._visits: dict[int, _Visit] = {}
         self._indexed: list[_Visit] = []
         self._recent: list[_Visit] = []
-        self._n_visits = 0
         self._world = 0
         self._connected: set[int] = set()
         self._n_searches: dict[int, int] = {}
@@ -200,20 +198,22 @@ class LoopDetector:
         describe = self._describe_densely if is_search else self._frontend.describe
         place = describe(observations)
         scores = self._index.scores(place.descriptors_left)
-        numbers = self._elsewhere(scores, world) if is_search else self._candidates(scores, near)
-        loops = self._register(numbers, place, observations)
+        visits = self._elsewhere(scores, world) if is_search else self._candidates(scores, near)
+        loops = self._register(visits, place, observations)
         if not is_place and not loops:
             return ()
         self._add(place, T_world_frame)
-        return tuple(self._confirm(loops, allows)) if loops else ()
+        if not loops:
+            return ()
+        confirmed = self._confirm(loops, allows)
+        return tuple(confirmed or self._confirm_alone(loops[0], place, observations))
 
     def keep(self, observations: Any, T_world_frame: FloatArray) -> None:  # noqa: ANN401
         """Add a frame of the latest world as a place, without looking."""
         self._add(self._describe_densely(observations), T_world_frame)
 
     def _add(self, place: Any, T_world_frame: FloatArray) -> None:  # noqa: ANN401
-        number, self._n_visits = self._n_visits, self._n_visits + 1
-        visit = _Visit(number=number, place=place, T_world_frame=T_world_frame, world=self._world)
+        visit = _Visit(place=place, T_world_frame=T_world_frame, world=self._world)
         self._visits[place.stamp_ns] = visit
         self._recent.append(visit)
         if len(self._recent) > _N_RECENT:
@@ -227,7 +227,7 @@ class LoopDetector:
 
     def _is_search(self, world: int) -> bool:
         """Tell whether a frame of a world that is not connected searches all others."""
-        if self._n_visits == 0:
+        if not self._visits:
             self._connected.add(world)
         if world in self._connected:
             return False
@@ -240,17 +240,16 @@ class LoopDetector:
 
     def _register(
         self,
-        numbers: Sequence[int],
+        visits: Iterable[_Visit],
         place: Any,  # noqa: ANN401
         observations: Any,  # noqa: ANN401
     ) -> list[Loop]:
         """Return the first loop; from a world that is not connected, all: they may contradict."""
         loops = []
-        for number in numbers:
-            reference = self._indexed[number].place
-            result = self._frontend.recognize(reference, place, observations)
+        for visit in visits:
+            result = self._frontend.recognize(visit.place, place, observations)
             if isinstance(result, RelativePose):
-                loops.append(_loop(reference.stamp_ns, place.stamp_ns, result))
+                loops.append(_loop(visit.place.stamp_ns, place.stamp_ns, result))
                 if self._world in self._connected:
                     break
         return loops
@@ -268,27 +267,25 @@ class LoopDetector:
             self._indexed.append(visit)
 
     def _shows_latest(self, T_world_frame: FloatArray) -> bool:
-        if not self._recent:
-            return False
-        latest = self._recent[-1]
-        T = se3.invert(T_world_frame) @ latest.T_world_frame
-        points, camera = latest.place.points_cam, self._frontend.camera
-        return view_overlap(points, T, camera) > _MAX_OVERLAP
+        return bool(self._recent) and self._shows(T_world_frame, self._recent[-1])
 
-    def _elsewhere(self, scores: FloatArray, world: int) -> list[int]:
+    def _shows(self, T_world_frame: FloatArray, visit: _Visit) -> bool:
+        """Tell whether a frame shows most of a place, by odometry."""
+        T = se3.invert(T_world_frame) @ visit.T_world_frame
+        return view_overlap(visit.place.points_cam, T, self._frontend.camera) > _MAX_OVERLAP
+
+    def _elsewhere(self, scores: FloatArray, world: int) -> list[_Visit]:
         """Return the places of other worlds that a view is most like."""
-        best = np.argsort(-scores).tolist()
-        return [k for k in best if self._indexed[k].world != world][:_N_CANDIDATES]
+        best = (self._indexed[k] for k in np.argsort(-scores))
+        return [visit for visit in best if visit.world != world][:_N_CANDIDATES]
 
-    def _candidates(self, scores: FloatArray, near: Container[int]) -> list[int]:
+    def _candidates(self, scores: FloatArray, near: Container[int]) -> list[_Visit]:
         if len(scores) == 0:
             return []
         limit = min(_ABOVE_NOISE * float(np.quantile(scores, _NOISE_QUANTILE)), _SURE_SCORE)
-        best = np.argsort(-scores)[: 4 * _N_CANDIDATES].tolist()
-        chosen = [
-            k for k in best if scores[k] >= limit and self._indexed[k].place.stamp_ns not in near
-        ]
-        return chosen[:_N_CANDIDATES]
+        best = np.argsort(-scores)[: 4 * _N_CANDIDATES]
+        chosen = (self._indexed[k] for k in best if scores[k] >= limit)
+        return [visit for visit in chosen if visit.place.stamp_ns not in near][:_N_CANDIDATES]
 
     def _confirm(self, loops: Sequence[Loop], allows: Callable[[Loop], bool]) -> list[Loop]:
         """Return the loops that are confirmed with the first of a frame, this one among them."""
@@ -315,6 +312,31 @@ class LoopDetector:
             self._n_searches[world] = min(self._n_searches[world], _N_EAGER - _N_WAITING)
         self.loops.latest = *latest, loop
         return confirmed
+
+    def _confirm_alone(
+        self,
+        loop: Loop,
+        place: Any,  # noqa: ANN401
+        observations: Any,  # noqa: ANN401
+    ) -> list[Loop]:
+        """Return the latest loop if the frame is found from the place beside, too, where it says.
+
+        No other frame may follow that could tell. One that shows the same place tells no more than
+        another place of this frame does, where these two are as far apart.
+        """
+        if not self._connected.issuperset(self._worlds_of(loop)):
+            return []
+        reference = self._visits[loop.reference_ns]
+        number = self._indexed.index(reference)
+        for earlier, later in pairwise(self._indexed[max(number - 1, 0) : number + 2]):
+            other = earlier if later is reference else later
+            is_apart = not self._shows(later.T_world_frame, earlier)
+            seconds = self._register([other], place, observations) if is_apart else []
+            if any(self._agree(second, loop) for second in seconds):
+                loop = replace(loop, reason="")
+                self.loops.latest = *self.loops.latest[:-1], loop
+                return [loop]
+        return []
 
     def _worlds_of(self, loop: Loop) -> tuple[int, int]:
         """Return the worlds of a loop's frame and of its reference."""

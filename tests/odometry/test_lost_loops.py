@@ -1,5 +1,7 @@
 """Loops connect what a lost camera measured before and after; odometry tells which are false."""
 
+from collections.abc import Container
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -231,6 +233,50 @@ def test_two_frames_of_another_world_are_connected_by_two_loops_to_the_same_one(
     assert [len(loops) for loops in looks] == [0, 2, 0, 0]
     assert (N_LAP + 15) * PERIOD_NS in detector
     assert (N_LAP + 20) * PERIOD_NS not in detector
+
+
+class Erring(MadeUpPlaces):
+    """The same, but what is measured from all places but some is wrong."""
+
+    def __init__(self, truth: FloatArray, n_per_lap: int, *, right: Container[int]) -> None:
+        super().__init__(truth, n_per_lap)
+        self.right = right
+
+    def recognize(
+        self, reference: SimpleNamespace, current: SimpleNamespace, observations: int
+    ) -> RelativePose | Failure:
+        result = super().recognize(reference, current, observations)
+        if isinstance(result, Failure) or reference.stamp_ns // PERIOD_NS in self.right:
+            return result
+        return replace(result, T_reference_current=result.T_reference_current @ AWAY)
+
+
+EVERYWHERE = range(1000)
+
+
+@pytest.mark.parametrize(
+    ("step", "right", "world", "is_confirmed"),
+    [
+        (7, EVERYWHERE, 0, True),
+        (7, [50, 57], 0, True),
+        (7, [43, 50], 0, True),
+        (7, [50], 0, False),  # the next places contradict it
+        (10, EVERYWHERE, 0, False),  # are not seen
+        (5, EVERYWHERE, 0, False),  # are the same view again
+        (7, EVERYWHERE, 1, False),  # do not suffice for a camera that was lost
+    ],
+)
+def test_a_loop_of_the_very_last_frame_counts_if_the_next_place_agrees(
+    step: int, right: Container[int], world: int, is_confirmed: bool
+) -> None:
+    truth = block(1.2, n_per_lap=500)
+    detector = LoopDetector(frontend=Erring(truth, 500, right=right))
+    detector.look(0, truth[0])
+    for j in [50 - step, 50, 50 + step, *range(100, 250, 10)]:
+        detector.keep(j, truth[j])
+    found = detector.look(550, truth[550], world=world)
+    assert [loop.reference_ns for loop in found] == [50 * PERIOD_NS] * is_confirmed
+    assert [bool(loop.reason) for loop in detector.loops] == [not is_confirmed]
 
 
 class Repeated(MadeUpPlaces):
