@@ -6,7 +6,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise, takewhile
+from itertools import takewhile
 from typing import Any, Final
 
 import numpy as np
@@ -30,9 +30,11 @@ _N_CANDIDATES = 3
 _NOISE_QUANTILE = 0.95
 _ABOVE_NOISE = 1.5
 _SURE_SCORE = 0.06
-# Places within which a second loop has to confirm one, the sigmas by which both may differ, and by
-# how much odometry may be wrong between them: per metre, and per radian.
+# Places within which a second loop has to confirm one, that of a later frame or, either way along
+# the places, of the same; the sigmas by which both may differ; and by how much odometry may be
+# wrong between them: per metre, and per radian.
 _N_WAITING = 5
+_N_BESIDE = 2
 _AGREEMENT = 5.0
 _DRIFT = 0.02
 # In a world that no loop connects with the others, so many frames search all of them; later ones
@@ -319,7 +321,7 @@ class LoopDetector:
         place: Any,  # noqa: ANN401
         observations: Any,  # noqa: ANN401
     ) -> list[Loop]:
-        """Return the latest loop if the frame is found from the place beside, too, where it says.
+        """Return the latest loop if the frame is found from a place beside, too, where it says.
 
         No other frame may follow that could tell. One that shows the same place tells no more than
         another place of this frame does, where these two are as far apart.
@@ -328,8 +330,9 @@ class LoopDetector:
             return []
         reference = self._visits[loop.reference_ns]
         number = self._indexed.index(reference)
-        for earlier, later in pairwise(self._indexed[max(number - 1, 0) : number + 2]):
-            other = earlier if later is reference else later
+        for other in self._indexed[max(number - _N_BESIDE, 0) : number + _N_BESIDE + 1]:
+            is_earlier = other.place.stamp_ns < loop.reference_ns
+            earlier, later = (other, reference) if is_earlier else (reference, other)
             is_apart = not self._shows(later.T_world_frame, earlier)
             seconds = self._register([other], place, observations) if is_apart else []
             if any(self._agree(second, loop) for second in seconds):

@@ -255,24 +255,25 @@ EVERYWHERE = range(1000)
 
 
 @pytest.mark.parametrize(
-    ("step", "right", "world", "is_confirmed"),
+    ("beside", "right", "world", "is_confirmed"),
     [
-        (7, EVERYWHERE, 0, True),
-        (7, [50, 57], 0, True),
-        (7, [43, 50], 0, True),
-        (7, [50], 0, False),  # the next places contradict it
-        (10, EVERYWHERE, 0, False),  # are not seen
-        (5, EVERYWHERE, 0, False),  # are the same view again
-        (7, EVERYWHERE, 1, False),  # do not suffice for a camera that was lost
+        ([43, 57], EVERYWHERE, 0, True),
+        ([43, 57], [50, 57], 0, True),
+        ([43, 57], [43, 50], 0, True),
+        ([55, 57], [50, 57], 0, True),
+        ([43, 57], [50], 0, False),  # they contradict it
+        ([40, 60], EVERYWHERE, 0, False),  # they are not seen
+        ([45, 55], EVERYWHERE, 0, False),  # they are the same view again
+        ([43, 57], EVERYWHERE, 1, False),  # does not suffice for a camera that was lost
     ],
 )
-def test_a_loop_of_the_very_last_frame_counts_if_the_next_place_agrees(
-    step: int, right: Container[int], world: int, is_confirmed: bool
+def test_a_loop_of_the_very_last_frame_counts_if_a_place_beside_agrees(
+    beside: list[int], right: Container[int], world: int, is_confirmed: bool
 ) -> None:
     truth = block(1.2, n_per_lap=500)
     detector = LoopDetector(frontend=Erring(truth, 500, right=right))
     detector.look(0, truth[0])
-    for j in [50 - step, 50, 50 + step, *range(100, 250, 10)]:
+    for j in sorted([*beside, 50, *range(100, 250, 10)]):
         detector.keep(j, truth[j])
     found = detector.look(550, truth[550], world=world)
     assert [loop.reference_ns for loop in found] == [50 * PERIOD_NS] * is_confirmed
