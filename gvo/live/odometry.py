@@ -6,7 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -20,7 +20,7 @@ from gvo.errors import GvoError, OutputError, RecordingError
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.io.bag.messages import transform_of
 from gvo.io.poses.base_frame import BaseFrame
-from gvo.io.recording import RecordingInfo, Source, StampedImage
+from gvo.io.recording import ChosenImages, Source, StampedImage
 from gvo.io.run_folder.writer import free_path
 from gvo.io.sync import Pair, Paired
 from gvo.live.publishing import Arrivals, LiveMessages
@@ -30,7 +30,6 @@ from gvo.runs.loop import RunLoop
 from gvo.runs.outputs.bag import TOPICS
 from gvo.runs.outputs.options import RunOutputs, name_frames
 from gvo.runs.run import RunResult, drawn, run_recording
-from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FaultyFrame, Progress, RgbdFrame, StereoFrame
 
 if TYPE_CHECKING:
@@ -202,7 +201,7 @@ class LiveOdometry:
             on_progress(state)
 
         result = run_recording(
-            _Stretch(self._source.info, self._stretches),
+            ChosenImages(info=self._source.info, images=self._stretches.next_stretch),
             folder,
             config=self.parameters.config,
             base_frame=self._base_frame,
@@ -276,20 +275,6 @@ class LiveOdometry:
         elif self._messages is not None:
             self._waiting.do(partial(self._messages.set_pose, T))
         return {}
-
-
-@dataclass(frozen=True, slots=True)
-class _Stretch:
-    """A source of the images of one run."""
-
-    info: RecordingInfo
-    stretches: Stretches
-
-    def images(self) -> Iterator[StampedImage]:
-        return self.stretches.next_stretch()
-
-    def ground_truth(self) -> Trajectory | None:
-        return None
 
 
 class Stretches:
