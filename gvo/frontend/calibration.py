@@ -447,12 +447,12 @@ def settle_rows(
     x, y, z = dt * (rates + 0.5 * dt * (se3.skew(velocity[:3]) @ rates))
     z += 1.0
     in_front = z > (_MIN_DEPTH_M / (camera.fx * camera.baseline)) * disparities
-    z[~in_front] = 1.0  # left as they are
+    z[~in_front] = 1.0  # not taken
     settled = np.empty_like(uvd)
     settled[:, 0] = (u - camera.cx + camera.fx * x) / z + camera.cx
     settled[:, 1] = (v - camera.cy + camera.fy * y) / z + camera.cy
     settled[:, 2] = disparities / z
-    return settled if in_front.all() else np.where(in_front[:, np.newaxis], settled, uvd)
+    return np.where(in_front[:, np.newaxis], settled, uvd)
 
 
 def settling_rates(
