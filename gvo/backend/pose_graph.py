@@ -9,8 +9,10 @@ M. Kaess et al., "iSAM2: Incremental smoothing and mapping using the Bayes tree"
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
+from types import MappingProxyType
 from typing import Any, TypeAlias
 
 import gtsam
@@ -66,6 +68,7 @@ class PoseGraph:
             # Propagate every change to the oldest pose: by default small ones are ignored, which
             # loses what smoothing gains with edges accurate to a tenth of a millimetre.
             parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
+        self._parameters = parameters
         self._isam = gtsam.ISAM2(parameters)
         self._n_poses = 0
         self._saved: gtsam.ISAM2 | None = None
@@ -177,6 +180,7 @@ class PoseGraph:
     def iterate(
         self,
         before: Mapping[int, gtsam.Pose3],
+        starts: Mapping[int, gtsam.Pose3] = MappingProxyType({}),
         *,
         alive: Collection[int] = (),
         leaving: Sequence[int] = (),
@@ -189,7 +193,9 @@ class PoseGraph:
         Parameters
         ----------
         before : mapping of int to gtsam.Pose3
-            Poses before the update, or start values, of the keys concerned.
+            Poses before the update, of the keys concerned.
+        starts : mapping of int to gtsam.Pose3
+            Start values of new poses.
         alive, leaving
             As for the update.
 
@@ -200,15 +206,61 @@ class PoseGraph:
         """
         if self._is_whole:
             return True
-        limit = _FAR
-        for _ in range(_MAX_STEPS):
-            after = {key: self.pose3(key) for key in before}
-            if _converged(before, after, limit):
-                return limit == _STILL
-            before, limit = after, _STILL
-            nothing = gtsam.NonlinearFactorGraph(), gtsam.Values()
-            self.update(*nothing, alive=alive, leaving=leaving)
+        poses = {**before, **starts}
+        if _converged(poses, self.poses3(poses), _FAR):
+            return False
+        after = self._settle(poses, alive, leaving)
+        turns = [after[key].compose(pose.inverse()) for key, pose in before.items()]
+        turn = max(turns, key=_angle, default=gtsam.Pose3())
+        if _angle(turn) > _FAR:
+            self._update_turned(turn, alive, leaving)
+            self._settle(poses, alive, leaving)
         return True
+
+    def _settle(
+        self, keys: Iterable[int], alive: Collection[int], leaving: Sequence[int]
+    ) -> dict[int, gtsam.Pose3]:
+        """Repeat the last update until poses converge; return them."""
+        after = self.poses3(keys)
+        for _ in range(_MAX_STEPS):
+            nothing, before = (gtsam.NonlinearFactorGraph(), gtsam.Values()), after
+            self.update(*nothing, alive=alive, leaving=leaving)
+            after = self.poses3(keys)
+            if _converged(before, after, _STILL):
+                break
+        return after
+
+    def _update_turned(
+        self, turn: gtsam.Pose3, alive: Collection[int], leaving: Sequence[int]
+    ) -> None:
+        """Turn the marginals of poses that left with the part of the graph that turned.
+
+        iSAM2 does not linearize the poses of a marginal again, and a step of Gauss-Newton from
+        afar is wrong. What a marginal says of its poses is the same wherever they are as a whole:
+        if a part of the graph turned, as when a loop ties it to the rest, the marginal is linear
+        about the turned poses as it was about those before.
+
+        Parameters
+        ----------
+        turn : gtsam.Pose3
+            T_new_old in the world.
+        alive, leaving
+            As for the update.
+        """
+        points, values = self._isam.getLinearizationPoint(), self.values()
+        factors = gtsam.NonlinearFactorGraph()
+        for factor in map(self.factors().at, range(self.factors().size())):
+            if isinstance(factor, gtsam.LinearContainerFactor):
+                turned = gtsam.Values()
+                for key in factor.keys():  # noqa: SIM118 - not a dict
+                    point = points.atPose3(key)
+                    candidates = [point, turn.compose(point)]
+                    turned.insert(key, min(candidates, key=partial(_distance, values.atPose3(key))))
+                factors.add(gtsam.LinearContainerFactor(factor.linearize(turned), turned))
+            elif factor is not None:
+                factors.add(factor)
+        self._isam, self._n_poses, self._saved = gtsam.ISAM2(self._parameters), 0, None
+        self.update(factors, values, alive=alive, leaving=leaving)
 
     def marginalize(self, keys: Sequence[int]) -> None:
         """Marginalize poses that the last update made leaves."""
@@ -222,6 +274,10 @@ class PoseGraph:
     def pose3(self, key: int) -> gtsam.Pose3:
         """Return T_world_frame as GTSAM holds it."""
         return self._isam.calculateEstimatePose3(key)
+
+    def poses3(self, keys: Iterable[int]) -> dict[int, gtsam.Pose3]:
+        """Return T_world_frame of each."""
+        return {key: self.pose3(key) for key in keys}
 
     def pose(self, key: int) -> FloatArray:
         """Return T_world_frame, shape (4, 4)."""
@@ -258,6 +314,14 @@ def _converged(
         return True
     moves = [before[key].localCoordinates(after[key]).tolist() for key in before]
     return bool(max(max(map(abs, move)) for move in moves) < limit)
+
+
+def _angle(T: gtsam.Pose3) -> float:
+    return float(T.rotation().axisAngle()[1])
+
+
+def _distance(first: gtsam.Pose3, second: gtsam.Pose3) -> float:
+    return float(np.linalg.norm(first.localCoordinates(second)))
 
 
 def first_line(error: BaseException) -> str:

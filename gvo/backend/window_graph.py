@@ -274,10 +274,10 @@ class WindowGraph:
         values = gtsam.Values()
         values.insert(key, pose.T_world_start)
         before = {e.reference_key: pose.T_world_references[e.edge.reference_id] for e in edges}
-        before[key] = pose.T_world_start
         factors = self._factors_of(pose, key, edges)
         self._isam.update(factors, values, alive=alive, leaving=leaving)
-        if self._isam.iterate(before, alive=[*alive, key], leaving=leaving):
+        start = {key: pose.T_world_start}
+        if self._isam.iterate(before, start, alive=[*alive, key], leaving=leaving):
             self._check_others()
 
     def _factors_of(
@@ -317,9 +317,8 @@ class WindowGraph:
     def _add_factor(self, frame_id: FrameId, factor: gtsam.NonlinearFactor) -> Estimate:
         factors = gtsam.NonlinearFactorGraph()
         factors.add(factor)
-        key = self.poses[frame_id].key
         with self._isam.restored_on_error():
-            before = {key: self._isam.pose3(key)}
+            before = self._isam.poses3(factor.keys())
             self._isam.update(factors, gtsam.Values())
             self._isam.iterate(before)
             estimate = self._estimate(frame_id)

@@ -757,6 +757,41 @@ def test_a_pose_that_closes_a_large_turn_settles_with_others(turn_rad: float, si
 # Sigmas many orders of magnitude apart: Cholesky calls the system indeterminate, QR solves it.
 
 
+@pytest.mark.parametrize("is_late", [False, True])
+@pytest.mark.parametrize("turn_rad", [0.4, -1.2])
+def test_what_hung_on_a_guess_is_turned_as_a_whole(turn_rad: float, is_late: bool) -> None:
+    n_before, sigma, rng = 10, 1e-3, np.random.default_rng(7)
+    poses = wander(rng, 90)
+    edges = [
+        [each for each in found if (number(each.reference_id) < n_before) == (frame < n_before)]
+        for frame, found in enumerate(net(poses, rng, sigma, n_back=4))
+    ]
+    T_guess = se3.exp(np.array([0.0, turn_rad, 0.1, 9.0, 1.0, 20.0]))
+    sigmas = np.array([1.0] * 3 + [10.0] * 3)
+    edges[n_before] = [
+        Edge(reference_id=9, T_reference_frame=T_guess, covariance=np.diag(sigmas**2))
+    ]
+    loop = measure(poses, 4, 60, rng, sigma)
+    window = SlidingWindow(WindowConfig(size=5, kernel="none"))
+    for frame, found in enumerate(edges):
+        is_joining = frame == 60
+        loops = [loop] if is_joining and not is_late else []
+        assert window.add_pose(frame, frame * STEP_NS, [*found, *loops]).rejected == ()
+        if is_joining and is_late:
+            assert window.add_edge(frame, loop)
+        if frame < n_before or (30 < frame < 60 and frame % 2):
+            window.keep(frame)
+        for kept in window.kept()[n_before:] if frame == 61 else window.kept()[: frame > 70]:
+            window.release(kept)
+        if frame >= 60:
+            held = {each: T for each, T in window.poses().items() if number(each) >= n_before}
+            true = np.array([poses[number(each)] for each in held])
+            step, true_step = (
+                se3.invert(T[:-1]) @ T[1:] for T in (np.array([*held.values()]), true)
+            )
+            np.testing.assert_allclose(step, true_step, atol=4.0 * sigma)
+
+
 @pytest.mark.parametrize(("start_sigma", "sigma"), [(1e2, 1e-2), (1e4, 1.0), (1.0, 1e-4)])
 @pytest.mark.parametrize("size", [None, N])
 def test_a_graph_takes_sigmas_that_defeat_cholesky(
