@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import stat
 import struct
@@ -155,7 +156,12 @@ def _read_bytes(path: Path) -> NDArray[np.uint8]:
             raise RecordingError(f"{path}: is no file")  # a device may never end
         if status.st_size > _MAX_FILE_BYTES:
             raise RecordingError(f"{path}: no image has {status.st_size} bytes, it is damaged")
-        return np.fromfile(path, dtype=np.uint8)
+        # With as few calls as can be: each hands Python's lock over to another thread.
+        file = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
+        try:
+            return np.frombuffer(os.read(file, status.st_size), dtype=np.uint8)
+        finally:
+            os.close(file)
     except FileNotFoundError as error:
         raise RecordingError(f"{path}: the file is missing") from error
     except OSError as error:
@@ -264,8 +270,7 @@ def depth_from_counts(counts: NDArray[Any], scale: float, where: str) -> DepthAr
         raise RecordingError(
             f"{where}: expected depth as 16-bit grey, got {counts.dtype} of shape {counts.shape}"
         )
-    depth: DepthArray = counts.astype(np.float32)
-    depth /= np.float32(scale)
+    depth: DepthArray = np.divide(counts, np.float32(scale), dtype=np.float32)
     # One look at each pixel for both: with one added, 65535 becomes 0 and 0 becomes 1.
     np.copyto(depth, np.nan, where=counts + np.uint16(1) <= 1)
     return depth
