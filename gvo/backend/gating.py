@@ -6,6 +6,7 @@ determine the start, and is better refused.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -44,10 +45,14 @@ class GateResult:
         Weighted mean of the predictions that agree with their medoid.
     reasons : list of str
         For each edge why it is refused; empty if it is not.
+    misfit : float
+        How far predictions lie from that mean, in squared sigmas per degree of freedom; NaN of a
+        single one.
     """
 
     T_world_start: gtsam.Pose3
     reasons: list[str]
+    misfit: float = math.nan
 
 
 def gate_edges(
@@ -88,7 +93,10 @@ def gate_edges(
     reasons = [""] * len(measurements)
     mean, spread = _mean(twists, informations)
     if spread <= min(_AGREEMENT, gate or _AGREEMENT) ** 2:
-        return GateResult(T_world_start=predictions[0].retract(mean), reasons=reasons)
+        T_world_start = predictions[0].retract(mean)
+        return GateResult(
+            T_world_start=T_world_start, reasons=reasons, misfit=_misfit(spread, len(twists))
+        )
     covariances = [measurement.edge.covariance for measurement in measurements]
     distances = _distances(twists, covariances)
     if gate is not None and distances.max() > gate:
@@ -103,8 +111,12 @@ def gate_edges(
         twists = _twists(predictions)
         distances = _distances(twists, covariances)
     is_near = _are_near_medoid(distances).tolist()
-    mean, _ = _mean(list(compress(twists, is_near)), list(compress(informations, is_near)))
-    return GateResult(T_world_start=predictions[0].retract(mean), reasons=reasons)
+    mean, spread = _mean(list(compress(twists, is_near)), list(compress(informations, is_near)))
+    return GateResult(
+        T_world_start=predictions[0].retract(mean),
+        reasons=reasons,
+        misfit=_misfit(spread, sum(is_near)),
+    )
 
 
 def disagreement(
@@ -194,6 +206,10 @@ def _mean(
     mean = dposv(sum(informations, _NOTHING), total)[1]
     squares = sum(float(np.vdot(x, y)) for x, y in zip(twists, weighted, strict=True))
     return mean, squares - float(np.vdot(total, mean))
+
+
+def _misfit(spread: float, n: int) -> float:
+    return spread / (6.0 * (n - 1)) if n > 1 else math.nan
 
 
 @lru_cache(maxsize=32)
@@ -358,6 +374,7 @@ class Admission:
             prior=prior,
             rejected=tuple(rejected),
             n_gated=len(gated),
+            misfit=result.misfit,
         )
 
     def _faults(self, frame_id: FrameId, edges: Sequence[Edge]) -> list[str]:

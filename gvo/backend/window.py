@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -62,6 +63,10 @@ class SlidingWindow:
     variance_factor : float
         By which covariances are multiplied that are given out: what those of all edges turned out
         to be too large by. Poses and gates do not depend on it.
+    misfit : float
+        How far the places that the edges of the last pose lead to lie from their mean, in squared
+        sigmas per degree of freedom: about one if their covariances are true. NaN with less than
+        two edges.
 
     Examples
     --------
@@ -92,6 +97,7 @@ class SlidingWindow:
         self._admission = Admission(self._graph, self._motion)
         self._batch_result: BatchResult | None = None
         self.variance_factor = 1.0
+        self.misfit = math.nan
 
     def __repr__(self) -> str:
         """Return the number of poses, the newest, and the counts in one line."""
@@ -200,6 +206,7 @@ class SlidingWindow:
         )
         self._graph.keep_causal(estimate)
         self._counter.add_pose(pose)
+        self.misfit = pose.misfit
         self._update_motion(pose, estimate)
         if self._keeps_by_distance and frame_id in self:
             self._keep_by_distance(frame_id)

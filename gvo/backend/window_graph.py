@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -67,6 +68,8 @@ class NewPose:
         Refused measurements.
     n_gated : int
         Edges among them that the other edges contradict.
+    misfit : float
+        Of its measurements, see `GateResult`.
     """
 
     frame_id: FrameId
@@ -78,6 +81,7 @@ class NewPose:
     support: Edge | PosePrior | None = None
     rejected: tuple[Rejected, ...] = ()
     n_gated: int = 0
+    misfit: float = math.nan
 
     @property
     def is_measured(self) -> bool:

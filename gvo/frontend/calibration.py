@@ -72,13 +72,11 @@ _DRIFT_PX = 5e-4
 _DRIFT_S = 1e-5
 # Innovations are clipped to so many sigmas.
 _MAX_SURPRISE = 3.0
-# Loops that the variance factor is averaged over; the shortest one, in seconds, as errors that last
-# do not show at once; the largest squared misclosure of one, per degree of freedom; and the share
-# of the variance that errors are taken to have which last for longer than loops.
-_N_LOOPS = 30
-_MIN_LOOP_S = 0.3
-_MAX_MISCLOSURE = 2.0
-_LASTING = 0.25
+# Misfits that a variance factor is averaged over; the largest, per degree of freedom; and the share
+# of the variance that errors are taken to have which registrations of the same motion share.
+_N_MISFITS = 30
+_MAX_MISFIT = 2.0
+_SHARED = 0.25
 # Moved to the middle of the exposure, points must stay in front of the camera.
 _MIN_DEPTH_M = 0.05
 
@@ -124,11 +122,11 @@ class ConstantFilter:
 
 
 class VarianceFactor:
-    """What the inflation of registrations' covariances should have been, by loops of them.
+    """What the inflation of registrations' covariances should have been, by those that agree.
 
     A link to a keyframe and the steps since then measure the same motion. Where they differ by less
-    than stated, errors of neighbouring tracks correlate less than `sigma_factor` assumes. What
-    lasts for longer than such a loop, it does not show: a part of the assumption always stays.
+    than stated, errors of neighbouring tracks correlate less than `sigma_factor` assumes. Errors
+    that both share, they do not show: a part of the assumption always stays.
 
     Parameters
     ----------
@@ -151,15 +149,15 @@ class VarianceFactor:
         self._least = min(sigma_factor**-2, 1.0)
         self._mean = 1.0
 
-    def note(self, misclosure: float, elapsed_s: float) -> None:
-        """Take a loop: its squared misclosure in stated sigmas per degree of freedom; its length.
+    def note(self, misfit: float) -> None:
+        """Take by how much registrations differ: squared, in stated sigmas, per degree of freedom.
 
-        A misclosure that is not finite is unknown.
+        What is not finite is unknown.
         """
-        if elapsed_s < _MIN_LOOP_S or not math.isfinite(misclosure):
+        if not math.isfinite(misfit):
             return
-        self._mean += (min(misclosure, _MAX_MISCLOSURE) - self._mean) / _N_LOOPS
-        value = _LASTING + (1.0 - _LASTING) * self._mean
+        self._mean += (min(misfit, _MAX_MISFIT) - self._mean) / _N_MISFITS
+        value = _SHARED + (1.0 - _SHARED) * self._mean
         self.value = min(max(value, self._least), 1.0)
 
 
@@ -257,8 +255,9 @@ class RigOffsets:
         Those of them that registrations tell, by name.
     velocities : FrameVelocities
         Of the frames that are in use.
-    variance_factor : VarianceFactor
-        Of the covariances of registrations.
+    chain_factor, window_factor : VarianceFactor
+        Of the covariances of registrations where they are chained, and where they are smoothed:
+        by loops of links and steps, and by the edges of one frame in the window.
     """
 
     def __init__(self, config: Config, *, is_stereo: bool = True) -> None:
@@ -281,7 +280,8 @@ class RigOffsets:
         self.velocities = FrameVelocities()
         # Matches of descriptors share a bias, and loops of them do: nothing is taken back there.
         is_tracking = config.frontend.kind == "klt"
-        self.variance_factor = VarianceFactor(config.klt.sigma_factor if is_tracking else 1.0)
+        sigma_factor = config.klt.sigma_factor if is_tracking else 1.0
+        self.chain_factor, self.window_factor = (VarianceFactor(sigma_factor) for _ in range(2))
         self._is_stereo = is_stereo
         self._disparity_error: ConstantError | None = None
         self._readout_errors: list[ConstantError] = []

@@ -49,6 +49,10 @@ _Observations: TypeAlias = Any
 _Offer: TypeAlias = tuple[LinkKind, Edge]
 
 
+# Of the misclosures that a variance factor is averaged over: errors that last do not show at once.
+_MIN_LOOP_NS = 300_000_000
+
+
 class Odometry:
     """Estimates the motion of a camera, or of any sensor with a front-end, from its frames.
 
@@ -180,14 +184,14 @@ class Odometry:
         """
         if self._camera is not None and not self._is_own:
             _check_frame(frame, self._camera)
-        watch = Stopwatch()
+        watch, offsets = Stopwatch(), self._frontend.rig_offsets
         with watch.stage("extract"):
             self._take_over_configuration()
             observations = self._frontend.extract(frame)
         with watch.stage("register"):
             step = self._chain.advance(
                 observations,
-                variance_factor=self._variance_factor(),
+                variance_factor=1.0 if offsets is None else offsets.chain_factor.value,
                 seeks_places=self._searching() is not None,
             )
             self._note_break(step)
@@ -200,6 +204,8 @@ class Odometry:
         with watch.stage("window"):
             offered += joining
             causal = self._add_to_window(step, offered, is_resumed=bool(joining))
+            if offsets is not None:
+                offsets.window_factor.note(self._window.misfit)
             T_previous_frame = self._last_step(step.estimate, causal)
             joins = self._join_segments(causal)
             self._select_keyframes(observations, step, scores, causal)
@@ -378,25 +384,26 @@ class Odometry:
         self._note_misclosure(link, step)
         return link
 
-    def _variance_factor(self) -> float:
-        offsets = self._frontend.rig_offsets
-        return 1.0 if offsets is None else offsets.variance_factor.value
-
     def _note_break(self, step: RawStep) -> None:
         """Let covariances be what edges state once a pose rests on a guess."""
         if step.failure is not None:
             self._starts, self._is_broken = {}, True
-        self._window.variance_factor = 1.0 if self._is_broken else self._variance_factor()
+        offsets = self._frontend.rig_offsets
+        if offsets is not None and not self._is_broken:
+            self._window.variance_factor = offsets.window_factor.value
+        else:
+            self._window.variance_factor = 1.0
 
     def _note_misclosure(self, link: Edge, step: RawStep) -> None:
         """Tell the front-end how well a link agrees with the raw chain since its keyframe."""
         offsets, start = self._frontend.rig_offsets, self._starts.get(int(link.reference_id))  # type: ignore[call-overload]
         if offsets is None or start is None:
             return
-        factor = offsets.variance_factor
+        if step.estimate.stamp_ns - start.stamp_ns < _MIN_LOOP_NS:
+            return
+        factor = offsets.chain_factor
         scaled = replace(link, covariance=factor.value * link.covariance)
-        elapsed_s = 1e-9 * (step.estimate.stamp_ns - start.stamp_ns)
-        factor.note(factor.value * misclosure(scaled, start, step.estimate), elapsed_s)
+        factor.note(factor.value * misclosure(scaled, start, step.estimate))
 
     def _edge_of(self, stamp_ns: int, result: RelativePose) -> Edge:
         return Edge(
