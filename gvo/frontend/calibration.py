@@ -278,14 +278,12 @@ class RigOffsets:
             if is_learnt
         }
         self.velocities = FrameVelocities()
-        # Matches of descriptors share a bias, and loops of them do: nothing is taken back there.
-        is_tracking = config.frontend.kind == "klt"
-        sigma_factor = config.klt.sigma_factor if is_tracking else 1.0
-        self.chain_factor, self.window_factor = (VarianceFactor(sigma_factor) for _ in range(2))
+        self._sigma_factor = math.nan
+        self.reconfigure(config)
         self._is_stereo = is_stereo
         self._disparity_error: ConstantError | None = None
         self._readout_errors: list[ConstantError] = []
-        self._row_error_px: float | None = None
+        self._row_px: float | None = None
         self._last_ns: int | None = None
         self._last_row_ns: int | None = None
 
@@ -318,6 +316,14 @@ class RigOffsets:
         """Tell whether anything is learnt."""
         return bool(self.learnt)
 
+    def reconfigure(self, config: Config) -> None:
+        """Forget the variance factors where another front-end states other covariances."""
+        # Matches of descriptors share a bias, and loops of them do: nothing is taken back there.
+        sigma_factor = config.klt.sigma_factor if config.frontend.kind == "klt" else 1.0
+        if sigma_factor != self._sigma_factor:
+            self._sigma_factor = sigma_factor
+            self.chain_factor, self.window_factor = map(VarianceFactor, [sigma_factor] * 2)
+
     def note(self, result: RelativePose, stamp_ns: int) -> None:
         """Take what a registration tells.
 
@@ -341,20 +347,20 @@ class RigOffsets:
             doubt = (result.n_matches / result.n_inliers) ** 2
             self._readout_errors.append(errors[READOUT].widened(doubt))
 
-    def note_rows(self, shift_px: float | None, stamp_ns: int) -> None:
-        """Take the remaining row offset of a frame; each frame counts once.
+    def note_rows(self, row_px: float | None, stamp_ns: int) -> None:
+        """Take the row offset of a frame; each frame counts once.
 
         Parameters
         ----------
-        shift_px : float or None
-            Row in the right image minus row in the left, minus the present value.
+        row_px : float or None
+            Row in the right image minus row in the left.
         stamp_ns : int
             Of that frame.
         """
         is_new = self._last_row_ns is None or stamp_ns > self._last_row_ns
-        if DISPARITY in self.learnt and is_new and shift_px is not None:
+        if DISPARITY in self.learnt and is_new and row_px is not None:
             self._last_row_ns = stamp_ns
-            self._row_error_px = shift_px
+            self._row_px = row_px
 
     def advance(self) -> None:
         """Apply the measurements taken since the last frame."""
@@ -364,13 +370,13 @@ class RigOffsets:
             error = self._disparity_error
             left_px = self.disparity_px + error.value - self.disparity.value
             self.disparity.update(left_px, _DISPARITY_FACTOR * error.sigma)
-        if self._row_error_px is not None:
-            self.row.update(self._row_error_px, _ROW_SIGMA_PX)
+        if self._row_px is not None:
+            self.row.update(self._row_px - self.row.value, _ROW_SIGMA_PX)
         used_s = self.readout_s
         for error in self._readout_errors[1:] or self._readout_errors:
             left_s = used_s + error.value - self.readout.value
             self.readout.update(left_s, _READOUT_FACTOR * error.sigma)
-        self._disparity_error, self._row_error_px, self._readout_errors = None, None, []
+        self._disparity_error, self._row_px, self._readout_errors = None, None, []
         note(
             "rig.offsets",
             disparity_px=self.disparity_px,

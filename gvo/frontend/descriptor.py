@@ -148,6 +148,14 @@ class DescriptorFrontend:
         -------
         RelativePose or Failure
         """
+        result = self._register(reference, current, prior)
+        if isinstance(result, RelativePose):
+            self.rig_offsets.note(result, current.stamp_ns)
+        return result
+
+    def _register(
+        self, reference: Observations, current: Observations, prior: MotionPrior | None
+    ) -> RelativePose | Failure:
         narrow, wide = self._config.temporal.radius_px, self._config.temporal.wide_radius_px
         if prior is not None:
             result = self._register_within(reference, current, prior, narrow)
@@ -215,7 +223,7 @@ class DescriptorFrontend:
             self.rig_offsets.velocities.expect(reference, current, T_predicted)
         matches = self._match(reference, current, T_predicted, radius_px)
         measured = Correspondences.of(reference, current, matches)
-        result = self._calibrated.register(
+        return self._calibrated.register(
             Measurements(
                 frames=(reference, current),
                 uvd=(measured.source_uvd, measured.target_uvd),
@@ -227,9 +235,6 @@ class DescriptorFrontend:
             prior=prior,
             is_step=is_step,
         )
-        if isinstance(result, RelativePose):
-            self.rig_offsets.note(result, current.stamp_ns)
-        return result
 
     def _match(
         self,

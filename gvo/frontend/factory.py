@@ -76,7 +76,7 @@ def find_change(former: Config, config: Config, *, is_stereo: bool) -> FrontendC
         is_any=any(getattr(former, name) != getattr(config, name) for name in _SECTIONS),
         is_of_extraction=_extraction(former, is_stereo) != _extraction(config, is_stereo),
         is_of_kind=_kind(former, is_stereo) != _kind(config, is_stereo),
-        is_of_rig=(former.camera, former.stereo) != (config.camera, config.stereo),
+        is_of_rig=former.camera != config.camera or (is_stereo and former.stereo != config.stereo),
     )
 
 

@@ -216,7 +216,8 @@ def choose_spread(
     """
     columns = -(-width // cell_size_px)
     # Cells and ranks are small integers, which NumPy sorts stably in linear time.
-    cells = ((pixels // cell_size_px) @ [1, columns]).astype(np.uint16)
+    cells = (pixels // cell_size_px) @ [1, columns]
+    cells = cells.astype(np.uint16 if cells.max(initial=0) < 1 << 16 else np.uint32)
     by_response = np.argsort(-responses, kind="stable")
     by_cell = np.argsort(cells[by_response], kind="stable")
     ranks = np.empty(len(pixels), dtype=np.uint16)

@@ -125,7 +125,7 @@ class KltFrontend:
         self, frame: Frame, offset_px: float, row_offset_px: float, klt: KltConfig | None = None
     ) -> KltCorners:
         corners = detect_corners(image_of(frame), klt or self._config.klt)
-        row_shift_px = None
+        row_px = None
         if isinstance(frame, StereoFrame):
             config, images = self._config.stereo, (frame.left, frame.right)
             limit = float(self.camera.depth_to_disparity(config.min_depth_m))
@@ -133,7 +133,8 @@ class KltFrontend:
                 images, corners, config, max_disparity=limit, row_offset_px=row_offset_px
             )
             disparities, slopes = measured.disparities, measured.slopes
-            row_shift_px = measured.row_shift_px
+            if measured.row_shift_px is not None:
+                row_px = measured.row_shift_px + row_offset_px
             is_valid = measured.are_reliable & self._is_in_range(disparities, offset_px)
         else:
             disparities, is_valid = self._measure_depth(frame, corners)
@@ -146,7 +147,7 @@ class KltFrontend:
             slopes=slopes[is_valid],
             points_cam=self.camera.unproject_stereo(keypoints, disparities - offset_px),
             n_keypoints=len(corners),
-            row_shift_px=row_shift_px,
+            row_px=row_px,
             templates=Templates.of(image_of(frame), keypoints),
         )
 
@@ -179,8 +180,8 @@ class KltFrontend:
             result = self._check_depth(reference, current, result)
         if isinstance(result, RelativePose):
             self.rig_offsets.note(result, current.stamp_ns)
-            row_shift_px = reference.find_corners().row_shift_px
-            self.rig_offsets.note_rows(row_shift_px, reference.stamp_ns)
+            row_px = reference.find_corners().row_px
+            self.rig_offsets.note_rows(row_px, reference.stamp_ns)
         return result
 
     def _register(
@@ -552,8 +553,8 @@ class KltCorners:
         The patches around them.
     n_keypoints : int
         Corners detected, measured or not.
-    row_shift_px : float or None
-        Remaining row offset of the right image; None where not measured.
+    row_px : float or None
+        Row offset of the right image; None where not measured.
     """
 
     keypoints: FloatArray
@@ -562,7 +563,7 @@ class KltCorners:
     points_cam: FloatArray
     templates: Templates
     n_keypoints: int
-    row_shift_px: float | None = None
+    row_px: float | None = None
 
 
 class _Reference(Protocol):

@@ -39,7 +39,8 @@ class PinholeCamera:
         values = (self.fx, self.fy, self.cx, self.cy)
         if not np.all(np.isfinite(values)) or self.fx <= 0 or self.fy <= 0:
             raise CalibrationError(
-                f"focal lengths must be positive and finite, got fx={self.fx} fy={self.fy}"
+                "focal lengths must be positive and all values finite, got "
+                f"fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy}"
             )
         if self.width <= 0 or self.height <= 0:
             raise CalibrationError(f"image size must be positive, got {self.width}x{self.height}")

@@ -77,6 +77,10 @@ def ransac_rigid(
     samples = near[draw_samples(len(near), config.n_hypotheses, rng)]
     note("ransac.samples", samples=samples, near=near)
     best = _search(samples, correspondences, camera, config, near=near)
+    if best is None and len(near) < n:  # near points on a line: far ones may not be
+        near = np.arange(n)
+        samples = draw_samples(n, config.n_hypotheses, rng)
+        best = _search(samples, correspondences, camera, config, near=near)
     if best is None:
         return Failure(reason=f"{n} points lie on a line", n_matches=n)
     return _refit(best, correspondences, camera, config, near=near, weights=weights)

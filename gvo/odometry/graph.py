@@ -275,6 +275,10 @@ class RunGraph:
         self.loops: Sequence[Loop] = ()
         self.T_map_world: FloatArray = np.eye(4)
 
+    def reconfigure(self, config: WindowConfig) -> None:
+        """Use another configuration from now on."""
+        self._config, self._factors = config, Factors(config)
+
     def __len__(self) -> int:
         """Return the number of keyframes."""
         return len(self._keyframes)

@@ -184,10 +184,11 @@ class Odometry:
         """
         if self._camera is not None and not self._is_own:
             _check_frame(frame, self._camera)
-        watch, offsets = Stopwatch(), self._frontend.rig_offsets
+        watch = Stopwatch()
         with watch.stage("extract"):
             self._take_over_configuration()
             observations = self._frontend.extract(frame)
+        offsets = self._frontend.rig_offsets
         with watch.stage("register"):
             step = self._chain.advance(
                 observations,
@@ -291,6 +292,7 @@ class Odometry:
         self._trust.mode = self._config.depth.icp
         self._keyframes.reconfigure(self._view(), self._config.window)
         self._chain.reconfigure(self._frontend, self._config.window, extracted)
+        self._graph.reconfigure(self._config.window)
         if not former.loops.enabled:
             self._begin_map()
 
@@ -302,6 +304,8 @@ class Odometry:
         change = find_change(former, self._config, is_stereo=isinstance(camera, StereoCamera))
         if change.is_any:
             offsets = None if change.is_of_rig else self._frontend.rig_offsets
+            if offsets is not None:
+                offsets.reconfigure(self._config)
             frontend = make_frontend(camera, self._config, rig_offsets=offsets)
             self._frontend = CheckedFrontend(frontend)
             if self._loops is not None and self._frontend.recognizer is not None:

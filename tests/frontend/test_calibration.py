@@ -143,6 +143,12 @@ def test_what_is_noted_counts_from_the_next_frame_and_once() -> None:
     disparity_px, row_px = offsets.disparity.value, offsets.row.value
     assert 0.0 < disparity_px <= 0.1
     assert 0.0 < row_px <= 0.2
+    for stamp_ns in range(12, 99):
+        offsets.note_rows(0.2, stamp_ns)  # measured while less of it was known
+        offsets.advance()
+        assert row_px <= offsets.row.value <= 0.2
+    assert offsets.row.value == pytest.approx(0.2, abs=0.01)
+    row_px = offsets.row.value
     offsets.advance()
     assert (offsets.disparity.value, offsets.row.value) == (disparity_px, row_px)
 

@@ -14,6 +14,7 @@ from gvo.frontend.features import (
     FeatureExtractor,
     Features,
     PlaceIndex,
+    choose_spread,
     describe_pixels,
     rank_in_group,
 )
@@ -93,6 +94,15 @@ def test_a_crowded_corner_does_not_take_the_whole_budget() -> None:
     assert len(features) == 100
     in_rest = np.all(features.keypoints >= 80, axis=1)
     assert in_rest.mean() > 0.5  # by strength alone: a fifth
+
+
+def test_cells_of_a_very_wide_image_are_told_apart() -> None:
+    # A million cells: these two would share their number, counted in sixteen bits.
+    pixels = np.array([[4, 4], [4, 8 * 128 + 4]])
+    chosen = choose_spread(pixels, np.array([2.0, 1.0]), width=4096, cell_size_px=8, n_chosen=2)
+    weak = np.vstack([pixels[:1] + 1, pixels])
+    alone = choose_spread(weak, np.array([1.5, 2.0, 1.0]), width=4096, cell_size_px=8, n_chosen=2)
+    assert (chosen.tolist(), alone.tolist()) == ([0, 1], [1, 2])
 
 
 def test_faint_images_are_tried_with_the_low_threshold() -> None:

@@ -195,6 +195,19 @@ def test_points_on_a_line_are_a_failure() -> None:
     assert result.n_matches == 30
 
 
+def test_where_near_points_lie_on_a_line_far_ones_tell() -> None:
+    rng = np.random.default_rng(5)
+    line = np.linspace(2.0, 3.0, 20)[:, np.newaxis] * [0.1, 0.05, 1.0]
+    far = 8.0 * random_points(rng, 60) + np.array([0.0, 0.0, 20.0])
+    source, T = np.vstack([line, far]), random_motion(rng)
+    matches = matched(source, move(T, source))
+    is_near = matches.source_uvd[:, 2] >= 5.0
+    assert (is_near[:20].all(), is_near[20:].any()) == (True, False)
+    result = run(matches, configure(min_disparity_px=5.0))
+    assert isinstance(result, Consensus)
+    np.testing.assert_allclose(result.T_target_source, T, atol=1e-6)
+
+
 def test_far_points_are_counted_but_not_fitted() -> None:
     T, matches, _ = scene(np.random.default_rng(4), 80, 0)
     depths = matches.source_points[:, 2]

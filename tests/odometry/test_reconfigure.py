@@ -167,6 +167,23 @@ def test_what_is_learnt_stays_until_its_sections_change(kind: str, section: dict
     assert renewed.readout.value == pytest.approx(0.009 if "camera" in section else 0.0)
 
 
+def test_the_inflation_that_is_taken_back_is_that_of_the_present_configuration() -> None:
+    odometry = odometry_of("stereo", Config())
+    odometry.track(recorded("stereo")[0])
+    learnt = odometry.rig_offsets
+    assert learnt is not None
+    for _ in range(99):
+        learnt.window_factor.note(0.1)
+        learnt.chain_factor.note(0.1)
+    odometry.reconfigure(change(Config(), klt={"n_corners": 200}))
+    odometry.track(recorded("stereo")[1])
+    assert odometry.window.variance_factor < 0.5
+    odometry.reconfigure(change(Config(), frontend={"kind": "descriptor"}))
+    odometry.track(recorded("stereo")[2])
+    assert odometry.rig_offsets is learnt
+    assert odometry.window.variance_factor == learnt.chain_factor.value == 1.0
+
+
 class OwnFrontend(KltFrontend):
     """A front-end of one's own, which is told."""
 
