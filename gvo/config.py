@@ -126,7 +126,9 @@ class KltConfig(Section):
         10, "size of the cells with at most one corner each", "px", ge=2, le=200
     )
     cell_size_px: int = _expert(40, "size of the cells that share the budget", "px", ge=8)
-    window_radius_px: int = _expert(4, "half size of the tracking window", "px", ge=2, le=50)
+    window_radius_px: int = _expert(
+        4, "half size of the window that Lucas-Kanade begins with", "px", ge=2, le=50
+    )
     n_levels: int = _expert(2, "pyramid levels above the image, from a prediction", ge=0, le=8)
     n_wide_levels: int = _expert(
         4, "pyramid levels above the image without a prediction, or after it failed", ge=0, le=8
@@ -142,7 +144,7 @@ class KltConfig(Section):
 
 
 class FeaturesConfig(Section):
-    """Keypoints and descriptors."""
+    """Keypoints and descriptors (frontend.kind: descriptor)."""
 
     kind: Literal["orb", "sift", "fast", "gftt"] = _expert(
         "orb", "detector: orb and sift with their own descriptors, fast and gftt with those of ORB"
@@ -177,25 +179,27 @@ class StereoConfig(Section):
 
     min_depth_m: float = _common(0.5, "minimum depth of a match", "m", gt=0)
     max_depth_m: float = _common(200.0, "maximum depth of a match", "m", gt=0)
-    row_tolerance_px: float = _expert(1.5, "maximum row difference of a match", "px", ge=0)
+    row_tolerance_px: float = _expert(
+        1.5, "maximum row difference of a match (descriptor)", "px", ge=0
+    )
     max_distance: float = _expert(
-        0.3, "maximum descriptor distance, relative to the largest possible", gt=0, le=1
+        0.3, "maximum distance of descriptors, relative to the largest possible", gt=0, le=1
     )
     max_ratio: float = _expert(
-        1.0, "maximum ratio of best to second-best descriptor distance; 1: no test", gt=0, le=1
+        1.0, "maximum ratio of best to second-best (descriptor); 1: no test", gt=0, le=1
     )
     subpixel: Literal["parabola", "none"] = _expert(
         "parabola", "disparity by a parabola through patch differences, or from the keypoints"
     )
     patch_radius_px: int = _expert(5, "half size of the patches", "px", ge=1, le=20)
     search_radius_px: int = _expert(3, "columns searched on either side", "px", ge=1, le=20)
-    sigma_px: float = _expert(0.3, "standard deviation of the disparity", "px", gt=0)
+    sigma_px: float = _expert(0.3, "standard deviation of the disparity (descriptor)", "px", gt=0)
     estimate_offset: bool = _expert(True, "estimate the constant disparity error of the rig online")
     offset_sigma_px: float = _expert(0.1, "prior standard deviation of that error", "px", gt=0)
 
 
 class TemporalConfig(Section):
-    """Matching of the reference and the current frame."""
+    """Matching of the reference and the current frame (frontend.kind: descriptor)."""
 
     radius_px: float = _expert(20.0, "search radius around a predicted pixel", "px", gt=0)
     wide_radius_px: float = _expert(
@@ -234,16 +238,20 @@ class RegistrationConfig(Section):
     refine: Literal["gauss_newton", "none"] = _expert(
         "gauss_newton", "refinement of the pose on (u, v, disparity) residuals after RANSAC"
     )
-    n_iterations: int = _expert(10, "maximum iterations of the refinement", ge=1, le=100)
+    n_iterations: int = _expert(
+        10, "maximum iterations after the inliers are chosen again", ge=1, le=100
+    )
     huber: float = _expert(
         1.5, "threshold of the Huber kernel on the whitened residual of a match", "sigma", gt=0
     )
     gate: float = _expert(
         3.0, "maximum whitened residual of an inlier of the refined pose", "sigma", gt=0
     )
-    pixel_sigma_px: float = _expert(0.7, "standard deviation of a keypoint's pixel", "px", gt=0)
+    pixel_sigma_px: float = _expert(
+        0.7, "standard deviation of a keypoint's pixel (descriptor)", "px", gt=0
+    )
     sigma_factor: float = _expert(
-        1.2, "largest inflation of a registration's sigmas: errors of the matches correlate", gt=0
+        1.2, "inflation of sigmas (descriptor): errors of the matches correlate", gt=0
     )
 
 

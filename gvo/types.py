@@ -251,7 +251,7 @@ class MotionPrior:
     T_predicted : ndarray of float64, shape (4, 4)
         T_reference_current as predicted by the last velocity, or by poses that are known.
     T_recent : ndarray of float64, shape (4, 4), optional
-        T_reference_current at the recent mean velocity, of consecutive frames. What passes the
+        T_reference_current at the recent median velocity, of consecutive frames. What passes the
         camera slowly draws the last velocity along, but not this one: it tells which of two
         motions is the camera's.
     is_confirmed : bool

@@ -12,7 +12,7 @@ from gvo.frontend.klt import KltFrontend, KltObservations
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.types import Frame
 
-# Sections that a front-end reads; KLT too falls back on `features` and `temporal`.
+# Sections that a front-end reads.
 _SECTIONS = (
     "camera",
     "frontend",

@@ -166,7 +166,7 @@ class KltFrontend:
         prior : MotionPrior, optional
             Tracks start at the pixels it predicts. Without it they start at the previous pixels,
             over more levels of the pyramid; where that fails descriptors are matched; the result
-            is the prior of a second round. The same is done where a prior with a recent mean
+            is the prior of a second round. The same is done where a prior with a recent median
             motion fails: the camera may have moved as never before. A keyframe, whose prior has
             none, is not worth that.
 

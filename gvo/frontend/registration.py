@@ -39,8 +39,9 @@ _N_ROUGH_ITERATIONS = 2
 _MAX_RATIO = 0.8
 # More RANSAC hypotheses: more matches are wrong than between neighbouring frames.
 _N_HYPOTHESES = 1000
-# Matches that have to agree, before the view tells: at least, and as a share. Of places that are
-# seen again from elsewhere a quarter of the matches is right, often fewer than twenty.
+# Matches that have to agree, before the view tells: at least, and as a share, of which
+# `ransac.min_inliers` are enough. Of places that are seen again from elsewhere a quarter of the
+# matches is right, often fewer than twenty.
 _MIN_INLIERS = 8
 _MIN_INLIER_SHARE = 0.2
 # Share of the points in view. In rendered streets of repeated facades, places that only look alike

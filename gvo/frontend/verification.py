@@ -8,7 +8,7 @@ there is none, the registration fails.
 
 What passes slowly before a camera biases the motion found by less than a match's sigmas per
 frame, and with it the prediction of the next one: when two motions can be told apart, the last
-velocity already speaks for the wrong one. The recent mean velocity does not. And matches are
+velocity already speaks for the wrong one. The recent median velocity does not. And matches are
 often far better than their sigmas, those of a camera at rest above all: how well they fit is
 measured here by themselves.
 
@@ -248,7 +248,7 @@ def _contradict(larger: _Group, smaller: _Group) -> Contradiction:
 
 
 def _prefer_recent_motion(found: Refinement, problem: _Problem, T_recent: FloatArray) -> Refinement:
-    """Return the motion of the matches that continue the recent mean motion.
+    """Return the motion of the matches that continue the recent median motion.
 
     Only where the motion found left it: a tenth of the matches must fit another motion alone,
     which is nearer to the recent one by a factor of two.

@@ -271,7 +271,7 @@ class RawChain(Generic[ObservationsT]):
         T_world_predicted = T_world_newest @ poses.predict(stamp_ns)[0]
         T_node_world = se3.invert(node.estimate.T_world_frame)
         elapsed_s = 1e-9 * (stamp_ns - poses.newest.stamp_ns)
-        T_newest_recent = se3.exp(self._recent.mean() * elapsed_s)
+        T_newest_recent = se3.exp(self._recent.median() * elapsed_s)
         return MotionPrior(
             T_predicted=T_node_world @ T_world_predicted,
             T_recent=T_node_world @ T_world_newest @ T_newest_recent,
@@ -344,7 +344,7 @@ class _RecentVelocities:
         self._velocities: list[tuple[int, FloatArray]] = []
         self._changes: list[tuple[int, FloatArray]] = []
 
-    def mean(self) -> FloatArray:
+    def median(self) -> FloatArray:
         """Return the median velocity, which outliers do not move."""
         return np.asarray(np.median([velocity for _, velocity in self._velocities], axis=0))
 

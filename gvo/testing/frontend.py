@@ -51,7 +51,7 @@ def check_frontend(
     - `extract` keeps the stamp and leaves the frame as it is;
     - a frame registered against itself has not moved;
     - T_reference_current is rigid, its covariance symmetric and positive definite, both float64;
-    - forth and back are inverse to each other, and a prior whose prediction or recent mean
+    - forth and back are inverse to each other, and a prior whose prediction or recent median
       motion is 10 sigma off changes nothing, both within 5 sigma of their covariances;
     - it maps the current frame to the reference, not the other way round (camera images only);
     - the same call gives the same result, bit for bit, and changes none of its arguments;
@@ -204,8 +204,8 @@ def _check_prior(
     for kind, prior in (
         ("a prior", MotionPrior(T_predicted=T)),
         ("a prior", MotionPrior(T_predicted=T_wrong)),
-        ("a recent mean motion", MotionPrior(T_predicted=T, T_recent=T)),
-        ("a recent mean motion", MotionPrior(T_predicted=T, T_recent=T_wrong)),
+        ("a recent median motion", MotionPrior(T_predicted=T, T_recent=T)),
+        ("a recent median motion", MotionPrior(T_predicted=T, T_recent=T_wrong)),
     ):
         guided = _register(frontend, reference, current, prior)
         if isinstance(guided, Failure):
