@@ -125,10 +125,12 @@ def test_frames_between_keyframes_lie_between_both_ends() -> None:
     np.testing.assert_allclose(np.diff(x), 1.0, atol=0.01)
 
 
-def test_frames_after_a_loss_go_with_what_comes_after_it() -> None:
+@pytest.mark.parametrize("is_changed", [False, True])
+def test_frames_after_a_loss_go_with_what_comes_after_it(is_changed: bool) -> None:
     truth = np.array([se3.exp(np.array([0, 0.01 * j, 0, 0, 0, 0.5 * j])) for j in range(16)])
     anywhere = WindowConfig(coasting_sigma_m_per_s=100.0, coasting_sigma_deg_per_s=900.0)
-    graph, drive = RunGraph(anywhere), Drive(truth)
+    graph, drive = RunGraph(WindowConfig() if is_changed else anywhere), Drive(truth)
+    graph.reconfigure(anywhere)
     for j in range(16):
         # From frame 8 on the camera was somewhere else than the guess says.
         status, edges = Status.OK, []

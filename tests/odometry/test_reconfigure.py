@@ -167,6 +167,15 @@ def test_what_is_learnt_stays_until_its_sections_change(kind: str, section: dict
     assert renewed.readout.value == pytest.approx(0.009 if "camera" in section else 0.0)
 
 
+def test_what_an_rgbd_camera_taught_outlasts_a_change_of_stereo() -> None:
+    odometry = odometry_of("rgbd")
+    odometry.track(recorded("rgbd")[0])
+    learnt = odometry.rig_offsets
+    odometry.reconfigure(change(Config(), stereo={"sigma_px": 0.4}))
+    odometry.track(recorded("rgbd")[1])
+    assert odometry.rig_offsets is learnt
+
+
 def test_the_inflation_that_is_taken_back_is_that_of_the_present_configuration() -> None:
     odometry = odometry_of("stereo", Config())
     odometry.track(recorded("stereo")[0])
