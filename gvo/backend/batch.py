@@ -563,22 +563,25 @@ class BatchOptimizer:
 
 
 def sparse_marginals(graph: gtsam.GaussianFactorGraph) -> Callable[[int], FloatArray]:
-    """Return what computes the marginal covariance of a pose by its key, of keys from 0 on.
+    """Return what computes the marginal covariance of a pose by its key.
 
     Raises
     ------
     RuntimeError
         If the poses are not determined.
     """
+    keys = sorted(graph.keyVector())
     rows, columns, values = graph.sparseJacobian_()
-    J = csc_array((values, (rows.astype(int) - 1, columns.astype(int) - 1)))[:, :-1]
+    places = np.array([rows, columns], dtype=int) - 1
+    # Zeros are left out, so the column of the residuals may seem to be missing.
+    J = csc_array((values, tuple(places)), shape=(places[0].max() + 1, 6 * len(keys) + 1))[:, :-1]
     solved = splu((J.T @ J).tocsc())
     pivots = np.abs(solved.U.diagonal())
     if pivots.min() < _LEAST_PIVOT * pivots.max():
         raise RuntimeError("a pose is not determined")
 
     def marginal(key: int) -> FloatArray:
-        block = slice(6 * key, 6 * key + 6)
+        block = 6 * keys.index(key) + np.arange(6)
         unit = np.zeros((J.shape[1], 6))
         unit[block] = np.eye(6)
         return np.asarray(solved.solve(unit)[block])

@@ -132,6 +132,20 @@ def test_stiff_parts_that_are_loosely_joined_have_covariances() -> None:
     assert np.diagonal(covariances[19]).max() < 1e-6
 
 
+def test_a_loosely_joined_tree_without_residuals_has_covariances() -> None:
+    step = se3.make_transform(np.eye(3), np.array([1.0, 0.0, 0.0]))
+    edges: dict[object, list[Edge]] = {0: [], "apart": []}
+    for k in range(1, 6):
+        covariance = (9.0 if k == 3 else 1e-6) * np.eye(6)
+        edges[k] = [Edge(reference_id=k - 1, T_reference_frame=step, covariance=covariance)]
+    covariances = gvo.optimize(edges, covariances=True).covariances
+    assert covariances is not None
+    expected = np.zeros((6, 6))
+    for k in range(1, 6):
+        expected = se3.compose_covariance(expected, step, edges[k][0].covariance)
+        np.testing.assert_allclose(covariances[k], expected, rtol=1e-3, atol=1e-6)
+
+
 def test_poses_that_nothing_joins_to_the_first_have_no_covariances() -> None:
     poses = circle()
     apart = [(b, each) for b, each in links(poses)[: N - 1] if b != N // 2]
