@@ -220,7 +220,7 @@ class WholeGraph:
         if self._trusted:
             return self._trusted
         ids, n = self.frame_ids, len(self.frame_ids)
-        is_numbered = all(isinstance(frame_id, int) for frame_id in ids)
+        is_numbered = all(isinstance(frame_id, int | np.integer) for frame_id in ids)
         order = sorted(range(n), key=lambda k: ids[k] if is_numbered else k)  # type: ignore[arg-type, return-value]
         ranks = {number: rank for rank, number in enumerate(order)}
         found: dict[int, int] = {}

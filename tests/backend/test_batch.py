@@ -286,6 +286,16 @@ def test_a_graph_is_optimized_out_of_a_mapping_of_any_names() -> None:
     assert sigmas[0] < sigmas[2] < sigmas[N // 4]
 
 
+def test_ids_of_numpy_are_whole_numbers_too() -> None:
+    poses = circle(4)
+    graph = WholeGraph()
+    for number in np.array([0, 2, 1, 3]):
+        graph.add_pose(number, int(number))
+    for b in (1, 2, 3):
+        graph.add_edges(b, [edge(poses, b - 1, b)])
+    assert graph.trusted() == [0, 1, 2]
+
+
 def test_misuse_of_optimize_is_a_value_error() -> None:
     with pytest.raises(ValueError, match="robust must be one of"):
         gvo.optimize({"a": []}, robust="cauchy")  # type: ignore[arg-type]
