@@ -167,8 +167,18 @@ class RunLoop:
         self.config = config
 
     def optimize(self) -> Optimum | None:
-        """Give the outputs of the run the optimum of all measurements, see `optimum`."""
-        optimum = self.optimum()
+        """Give the outputs the optimum of all measurements, at the end of a run.
+
+        Returns
+        -------
+        Optimum or None
+            As of `optimum`; also None where GTSAM fails: `output_faults` says so.
+        """
+        try:
+            optimum = self.optimum()
+        except SmoothingError as error:
+            self.output_faults.append(f"no global poses: {error}")
+            return None
         if optimum is not None:
             self._give(lambda output: output.add_optimum(optimum))
         return optimum
@@ -179,15 +189,16 @@ class RunLoop:
         Returns
         -------
         Optimum or None
-            None if it is not asked for, and where GTSAM fails: `output_faults` says so.
+            None if it is not asked for.
+
+        Raises
+        ------
+        SmoothingError
+            If GTSAM fails.
         """
         if not self.config.loops.enabled or self.statistics.n_with_pose == 0:
             return None
-        try:
-            optimum = self._odometry.optimize()
-        except SmoothingError as error:
-            self.output_faults.append(f"no global poses: {error}")
-            return None
+        optimum = self._odometry.optimize()
         place = self.base_frame.apply_to_edge
         return replace(
             optimum,

@@ -106,8 +106,8 @@ def run_recording(
         Of a camera that is running, see `gvo.frames`; its first images identify no recording.
     on_start : callable, optional
         Called before the first frame with the loop, and with what writes the summary and the
-        global poses so far, to be called between frames. Returns outputs that are given each
-        frame first.
+        global poses so far, to be called between frames; it raises `SmoothingError` where the
+        global poses fail. Returns outputs that are given each frame first.
     on_progress : callable, optional
         Called after each frame.
     on_written : callable, optional
@@ -158,12 +158,12 @@ def run_recording(
 
 
 def _save(loop: RunLoop, folder: RunFolder, summary: RunningSummary) -> None:
-    """Write what is known in the middle of a run."""
+    """Write what is known in the middle of a run; last the global poses, which may fail."""
+    loop.count()
+    summary.write("running")
     optimum = loop.optimum()
     if optimum is not None:
         folder.add_optimum(optimum)
-    loop.count()
-    summary.write("running")
 
 
 def _close(files: ExitStack) -> list[str]:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,14 +12,17 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 import gvo
-from gvo.errors import RecordingError, TrajectoryError
+from gvo.errors import RecordingError, SmoothingError, TrajectoryError
 from gvo.geometry import se3
 from gvo.io.poses.inputs import find_base_frame, read_truth
 from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.odometry.odometry import Odometry
+from gvo.runs.loop import Output, RunLoop
 from gvo.testing import faults as made
 from gvo.testing.faults import FaultySource
 from gvo.trajectory.formats import read_covariances, write_kitti
 from gvo.trajectory.trajectory import Trajectory
+from gvo.types import Optimum, Progress
 from tests.conftest import Command, run_of
 from tests.io.pose_bags import PoseBag
 from tests.rendered_walk import (
@@ -313,6 +317,32 @@ def test_an_antenna_on_a_lever_arm_gives_the_errors_of_its_place(
         assert evaluation.ate_m == pytest.approx(ate_by_hand(found, points), abs=2e-4)
         assert evaluation.rpe_deg is None
         assert evaluation.ate_m < 4 * ate_by_hand(poses[:, :3, 3], exact[:, :3, 3]) < 0.02
+
+
+def test_global_poses_that_fail_in_the_middle_are_no_fault_at_the_end(
+    room: SyntheticRecording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    saves: list[Callable[[], None]] = []
+
+    def on_start(_: RunLoop, save: Callable[[], None]) -> list[Output]:
+        saves.append(save)
+        return []
+
+    def fail(_: Odometry) -> Optimum:
+        raise SmoothingError("GTSAM: not now")
+
+    def save_badly(progress: Progress) -> None:
+        if progress.n_done == 6:
+            with monkeypatch.context() as patch:
+                patch.setattr(Odometry, "optimize", fail)
+                with pytest.raises(SmoothingError, match="not now"):
+                    saves[0]()
+            assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 6
+
+    result = gvo.run_recording(room, tmp_path, on_start=on_start, on_progress=save_badly)
+    assert result.is_complete
+    assert result.warnings == ()
+    assert len(gvo.read_trajectory(tmp_path / "global.txt")) == 12
 
 
 def test_a_bag_that_is_refused_leaves_no_folder(room: SyntheticRecording, tmp_path: Path) -> None:
