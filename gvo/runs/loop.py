@@ -328,8 +328,11 @@ def edge_over(window: SlidingWindow, stamp_ns: int, span_ns: int) -> Edge | None
     Returns
     -------
     Edge or None
-        None where no pose of the window is so much older, up to half a second.
+        None where no pose of the window is so much older, up to half a second, or the newest could
+        not be put into it.
     """
+    if stamp_ns not in window:
+        return None
     ages_ns = {pose: stamp_ns - window.stamp_ns(pose) for pose in window.poses()}
     start = min(ages_ns, key=lambda pose: abs(ages_ns[pose] - span_ns))
     if abs(ages_ns[start] - span_ns) > _MOST_OFF_NS:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from gvo.backend.window import SlidingWindow
 from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.geometry import se3
@@ -16,8 +17,8 @@ from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import Sensor
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.odometry.odometry import Odometry
-from gvo.runs.loop import RunLoop
-from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Optimum, Progress
+from gvo.runs.loop import RunLoop, edge_over
+from gvo.types import Edge, Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Optimum, Progress
 from tests.recordings import Held, hold
 from tests.rendered_walk import CAMERA, T_BASE_CAM, moved_by_hand
 
@@ -205,6 +206,17 @@ def test_interrupted_it_hands_out_the_poses_that_the_window_holds(walk: Held) ->
     with pytest.raises(KeyboardInterrupt):
         loop_over(walk).run([kept], interrupt)
     assert len(kept.frames) == len(kept.smoothed) == 5
+
+
+def test_a_pose_that_could_not_be_put_into_the_window_has_no_edge_to_it() -> None:
+    window = SlidingWindow()
+    window.add_pose(0, 0, [])
+    assert edge_over(window, 10**9, 10**9) is None
+    step = Edge(reference_id=0, T_reference_frame=np.eye(4), covariance=1e-4 * np.eye(6))
+    window.add_pose(10**9, 10**9, [step])
+    edge = edge_over(window, 10**9, 10**9)
+    assert edge is not None
+    assert edge.reference_id == 0
 
 
 def test_opencv_gets_its_threads_back(walk: Held) -> None:
