@@ -13,7 +13,7 @@ from gvo._version import __version__
 from gvo.backend.batch import BatchOptimizer, Robust, WholeGraph
 from gvo.backend.window import Keeping, SlidingWindow
 from gvo.config import Config
-from gvo.errors import GvoError, OutputError, RecordingError, TrajectoryError
+from gvo.errors import GvoError, OutputError, RecordingError, SmoothingError, TrajectoryError
 from gvo.io.edges.events import EdgeSource, Event, InputFaults, PoseEvent
 from gvo.io.edges.lines import (
     CSV_HEADER,
@@ -454,7 +454,7 @@ def optimize_edges(
         As of `optimize`; where omitted "none" for a pose graph, which states its noise, else
         "huber".
     covariances : bool
-        As of `optimize`.
+        As of `optimize`; where they cannot be computed, the result is not complete and says why.
     ground_truth : Trajectory, optional
         True poses of the same frame.
     force : bool
@@ -487,22 +487,40 @@ def optimize_edges(
         found = None
         try:
             optimizer.run()
-            found = optimizer.covariances() if covariances else None
+            try:
+                found = optimizer.covariances() if covariances else None
+            except SmoothingError as error:
+                notes.warnings.append(str(error))
         finally:
             # Also where the work is interrupted.
             smoothed = optimizer.trajectory(found)
             folder.add_trajectory("smoothed", smoothed)
             folder.add_trajectory("raw", optimizer.trajectory(of=optimizer.raw))
-            folder.add_rows(_rows(graph, optimizer))
-            if file is not None:
-                for number, T in zip(optimizer.numbers, optimizer.poses(), strict=True):
-                    file.add(graph.stamps_ns[number], graph.frame_ids[number], T)
+            _write_poses(graph, optimizer, folder, file)
     estimates = {"raw": optimizer.trajectory(of=optimizer.raw), "smoothed": smoothed}
     truth = _with_stamps(ground_truth, source, folder)
     warnings = [*_broken_off(len(graph.frame_ids), notes), *_left_out(graph, optimizer)]
-    summary = {
+    warnings += notes.warnings
+    summary = _batch_summary(graph, optimizer, robust, notes)
+    return _written(folder, summary, estimates, truth, warnings, not warnings, on_written)
+
+
+def _write_poses(
+    graph: WholeGraph, optimizer: BatchOptimizer, folder: RunFolder, file: GraphFile | None
+) -> None:
+    """Write the table of poses, and those of a pose graph into its file."""
+    folder.add_rows(_rows(graph, optimizer))
+    if file is not None:
+        for number, T in zip(optimizer.numbers, optimizer.poses(), strict=True):
+            file.add(graph.stamps_ns[number], graph.frame_ids[number], T)
+
+
+def _batch_summary(
+    graph: WholeGraph, optimizer: BatchOptimizer, robust: Robust, notes: SmoothingNotes
+) -> dict[str, Any]:
+    return {
         "gvo_version": __version__,
-        "recording": source.name,
+        "recording": notes.recording,
         "decisions": notes.decisions,
         "frames": len(graph.frame_ids),
         "tracked": len(optimizer.numbers),
@@ -511,8 +529,6 @@ def optimize_edges(
         "batch": optimizer.as_json(),
         "peak_memory_mb": round(peak_memory_mb(), 1),
     }
-    warnings += notes.warnings
-    return _written(folder, summary, estimates, truth, warnings, not warnings, on_written)
 
 
 def _rows(graph: WholeGraph, optimizer: BatchOptimizer) -> Iterator[tuple[object, ...]]:

@@ -24,6 +24,7 @@ from gvo.trajectory.formats import read_covariances, write_tum
 from gvo.trajectory.g2o import format_edge, format_vertex
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Edge, FloatArray
+from tests.conftest import Command
 
 TRAJECTORIES = ("raw", "causal", "smoothed")
 SECOND = 1_000_000_000
@@ -160,6 +161,23 @@ def test_covariances_are_those_of_gtsam_and_can_be_read_back(tmp_path: Path) -> 
     assert record.trajectories["raw"].covariances is None
     assert len(record.trajectories["causal"]) == 0
     assert record.frames.statuses == ("ok",) * 27
+
+
+def test_poses_whose_covariances_fail_are_written_without_them(
+    tmp_path: Path, command: Command
+) -> None:
+    sigmas = [1e4 if k == 2 else 1e-6 for k in range(5)]
+    lines = [format_edge(k, k + 1, step(k), s**2 * np.eye(6)) for k, s in enumerate(sigmas)]
+    path, out = tmp_path / "tree.g2o", tmp_path / "out"
+    path.write_text("\n".join(lines) + "\n")
+    answer = command("smooth", path, "--covariances", "--out", out)
+    assert answer.code == 3
+    assert "no covariances" in answer.err
+    record = read_run(out)
+    assert record.trajectories["smoothed"].covariances is None
+    assert len(record.trajectories["smoothed"]) == 6
+    assert "no covariances" in json.loads((out / "summary.json").read_text())["warnings"][0]
+    assert (out / "trajectories.png").exists()
 
 
 def test_false_edges_are_refused_and_named_in_the_table(tmp_path: Path) -> None:
