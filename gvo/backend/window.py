@@ -128,7 +128,7 @@ class SlidingWindow:
 
     @property
     def batch_result(self) -> BatchResult | None:
-        """The batch optimization in `finish`, if the window kept everything; else None."""
+        """The batch optimization in `finish`; None if `size` was not null from the start."""
         return self._batch_result
 
     def reconfigure(self, config: WindowConfig) -> None:
@@ -138,8 +138,8 @@ class SlidingWindow:
         ----------
         config : WindowConfig
             With a smaller size poses leave with the next updates, up to 32 at a time. With
-            `size: null` no more poses leave; if some left before, `finish` does no batch
-            optimization.
+            `size: null` no more poses leave; `finish` does a batch optimization only if it was
+            null from the first pose on.
 
         Raises
         ------
@@ -356,7 +356,7 @@ class SlidingWindow:
     def finish(self) -> list[Estimate]:
         """Return all estimates that were not popped yet, by stamp, and empty the window.
 
-        If no pose left before, they are optimized in a batch first.
+        A window that kept all poses from the start (`size: null`) is optimized in a batch first.
         """
         self._batch_result = self._graph.finish()
         self._motion.restart()

@@ -472,7 +472,7 @@ class WindowGraph:
         return finished
 
     def finish(self) -> BatchResult | None:
-        """Let all poses leave, optimized in a batch if none left before, and begin anew."""
+        """Let all poses leave and begin anew; a whole graph is optimized in a batch first."""
         result = None
         if self._is_whole and self.poses:
             try:
