@@ -391,9 +391,9 @@ class SlidingWindow:
         """Say why an edge between known poses is refused; empty if it is not."""
         if self._config.gate is None:
             return ""
-        known = self.relative_pose(edge.reference_id, frame_id)
+        T = se3.invert(self.pose(edge.reference_id)) @ self.pose(frame_id)
         covariance = self._graph.relative_covariance(edge.reference_id, frame_id)
-        return disagreement(edge, known.T_reference_frame, covariance, gate=self._config.gate)
+        return disagreement(edge, T, covariance, gate=self._config.gate)
 
     def _scaled(self, estimate: Estimate) -> Estimate:
         if self.variance_factor == 1.0:
