@@ -28,8 +28,8 @@ between the causal poses of their frames (namespace `causal`); at the end all th
 the global ones (`global`).
 
 The velocity of an `Odometry` is that from the pose before, as far as it was known, to this one; 0
-where none was. Its covariance is known for the raw poses alone, from the registration between the
-two; elsewhere, and where the chain coasts, its diagonal is -1.
+where none was. Its covariance is that of the registration between the two, for the raw poses and
+those in `gvo/odom`; elsewhere, and where they coast, its diagonal is -1.
 
 Smoothed poses of keyframes come late, when all that sees them has left the window. A tf buffer
 drops what is more than its cache time (10 s by default) behind; `Odometry` and the paths hold
@@ -209,7 +209,7 @@ class RunMessages:
         poses = frames.corrected(result.stamp_ns, T_world_base, self._T_odom_base)
         write_transforms(self._writer, "/tf", poses)
         estimate = replace(causal, T_world_frame=self._T_odom_base)
-        twist = twist_between(estimate, previous, self._step_covariance(result, result.raw))
+        twist = twist_between(estimate, previous, self._step_covariance(result, causal))
         names = frames.odom, frames.base_by(ODOM)
         messages.write_odometry(self._writer, f"/gvo/{ODOM}/odometry", estimate, names, twist)
 
@@ -219,16 +219,16 @@ class RunMessages:
             header, number = Header(self._newest_ns, self._frames.world), next(self._numbers)
             messages.write_lines(self._writer, header, segments, name=name, number=number)
 
-    def _step_covariance(self, result: FrameResult, raw: Estimate) -> FloatArray | None:
-        """Return the covariance (6, 6) of the last step of the raw chain, where it is known.
+    def _step_covariance(self, result: FrameResult, pose: Estimate) -> FloatArray | None:
+        """Return the covariance (6, 6) of the last step to a pose by its registration, if known.
 
         After coasting, the registration is against an older frame than the pose before.
         """
         last = self._last
-        is_step = last is not None and last.status == raw.status == Status.OK
+        is_step = last is not None and last.status == pose.status == Status.OK
         if not is_step or result.registration is None:
             return None
-        Ad = se3.adjoint(self._frames.mount(raw.stamp_ns))
+        Ad = se3.adjoint(self._frames.mount(pose.stamp_ns))
         return np.asarray(Ad @ result.registration.covariance @ Ad.T)
 
     def _write_odometry(

@@ -439,13 +439,14 @@ def _velocity(message: _Message) -> FloatArray:
 
 
 @_FRAMES
-def test_the_covariance_of_the_raw_velocity_is_that_of_the_registration(
-    tmp_path: Path, stereo_run: _Run, names: RunFrames
+@pytest.mark.parametrize("kind", ["raw", "odom"])
+def test_the_covariance_of_a_measured_velocity_is_that_of_the_registration(
+    tmp_path: Path, stereo_run: _Run, names: RunFrames, kind: str
 ) -> None:
     messages = _written(tmp_path / "run.mcap", stereo_run, names)
     stamps = [frame.stamp_ns for frame in stereo_run.frames]
     order = [3, 4, 5, 0, 1, 2]
-    for index, message in enumerate(messages["/gvo/raw/odometry"]):
+    for index, message in enumerate(messages[f"/gvo/{kind}/odometry"]):
         found = message.content.twist.covariance.reshape(6, 6)[np.ix_(order, order)]
         registration = stereo_run.results[index].registration
         if index == 0 or registration is None:
@@ -455,9 +456,23 @@ def test_the_covariance_of_the_raw_velocity_is_that_of_the_registration(
         expected = _mounted(step, names.mount(0)).covariance
         elapsed_s = 1e-9 * (stamps[index] - stamps[index - 1])
         np.testing.assert_allclose(found * elapsed_s**2, expected, rtol=1e-4, atol=1e-12)
-    for kind in ("causal", "smoothed"):
-        for message in messages[f"/gvo/{kind}/odometry"]:
+    for other in ("causal", "smoothed"):
+        for message in messages[f"/gvo/{other}/odometry"]:
             np.testing.assert_array_equal(message.content.twist.covariance, -np.eye(6).ravel())
+
+
+def test_a_registration_that_the_window_refused_is_not_the_velocitys_in_odom(
+    tmp_path: Path,
+) -> None:
+    with RunBag(tmp_path / "run.mcap") as bag:
+        for k, status in enumerate([Status.OK, Status.OK, Status.COASTING]):
+            frame, result = _made_up(_START_NS + k * _SECOND_NS)
+            causal = replace(result.causal, status=status)
+            bag.add_frame(frame, replace(result, causal=causal, T_previous_frame=np.eye(4)))
+    messages = _read(tmp_path / "run.mcap")
+    for kind, expected in (("raw", [-1, 1, 1]), ("odom", [-1, 1, -1])):
+        covariances = [m.content.twist.covariance for m in messages[f"/gvo/{kind}/odometry"]]
+        assert [covariance[0] for covariance in covariances] == expected
 
 
 @_KINDS
