@@ -157,9 +157,9 @@ class RunLoop:
                 raise
             finally:
                 finished = self._placed(self._odometry.finish())
+                self.count()
                 if is_writable:
                     self._give(lambda output: output.add_smoothed(finished))
-                self.count()
 
     def reconfigure(self, config: Config) -> None:
         """Change the configuration from the next frame on, see `Odometry.reconfigure`."""

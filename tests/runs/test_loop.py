@@ -10,7 +10,7 @@ import pytest
 
 from gvo.backend.window import SlidingWindow
 from gvo.config import Config
-from gvo.errors import RecordingError
+from gvo.errors import OutputError, RecordingError
 from gvo.geometry import se3
 from gvo.io.excerpt import Excerpt
 from gvo.io.poses.base_frame import BaseFrame
@@ -217,6 +217,17 @@ def test_a_pose_that_could_not_be_put_into_the_window_has_no_edge_to_it() -> Non
     edge = edge_over(window, 10**9, 10**9)
     assert edge is not None
     assert edge.reference_id == 0
+
+
+def test_frames_are_counted_also_where_the_last_poses_cannot_be_written(walk: Held) -> None:
+    class Full(Kept):
+        def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
+            raise OutputError("no space")
+
+    loop = loop_over(walk)
+    with pytest.raises(OutputError, match="no space"):
+        loop.run([Full()], None)
+    assert loop.statistics.window.n_poses == _N_FRAMES
 
 
 def test_opencv_gets_its_threads_back(walk: Held) -> None:
