@@ -49,6 +49,13 @@ class Output(Protocol):
         """Write, at the end, the poses that fit all measurements best, and the loops."""
 
 
+class FileOutput(Output, Protocol):
+    """An output to a file, which is complete when it is closed."""
+
+    def close(self) -> None:
+        """Complete the file; a second call does nothing."""
+
+
 class RunLoop:
     """Odometry over a recording, or a part of it.
 

@@ -27,7 +27,7 @@ from gvo.io.poses.truth import Truth, TruthComparison
 from gvo.io.recording import Source
 from gvo.io.run_folder.reader import read_run, trajectory_names
 from gvo.io.run_folder.writer import GLOBAL, PICTURE, REPORT, RunFolder, written_alone
-from gvo.runs.loop import Output, RunLoop, motions_of_window
+from gvo.runs.loop import FileOutput, Output, RunLoop, motions_of_window
 from gvo.runs.outputs.options import RunOutputs
 from gvo.runs.summary import RunningSummary, optimum_json, run_identity, summarize
 from gvo.trajectory.alignment import MAX_DIFFERENCE_NS
@@ -147,7 +147,8 @@ def run_recording(
             first = on_start(loop, partial(_save, loop, folder, summary)) if on_start else ()
             loop.run([*first, folder, *others], summary)
             optimum = loop.optimize()
-            faults = [*dict.fromkeys([*loop.output_faults, *_close(files)])]
+            faults = [*dict.fromkeys([*loop.output_faults, *_close([folder, *others])])]
+            files.pop_all()  # nothing is left to close
         _LOGGER.debug("all frames are tracked; comparing and writing the summary")
         is_asked = ground_truth is not None
         identity = {GLOBAL: optimum_json(optimum), "run": identity}
@@ -166,13 +167,15 @@ def _save(loop: RunLoop, folder: RunFolder, summary: RunningSummary) -> None:
         folder.add_optimum(optimum)
 
 
-def _close(files: ExitStack) -> list[str]:
-    """Complete the files; one that is not whole takes nothing from the run."""
-    try:
-        files.close()
-    except RecordingError as error:
-        return [str(error)]
-    return []
+def _close(files: Iterable[FileOutput]) -> list[str]:
+    """Complete the files; those that are not whole take nothing from the run."""
+    faults: list[str] = []
+    for file in files:
+        try:
+            file.close()
+        except RecordingError as error:
+            faults.append(str(error))
+    return faults
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -18,6 +18,7 @@ from gvo.io.poses.inputs import find_base_frame, read_truth
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.odometry.odometry import Odometry
 from gvo.runs.loop import Output, RunLoop
+from gvo.runs.outputs.bag import RunBag
 from gvo.testing import faults as made
 from gvo.testing.faults import FaultySource
 from gvo.trajectory.formats import read_covariances, write_kitti
@@ -365,3 +366,22 @@ def test_a_film_that_is_not_whole_takes_nothing_from_the_run(
     summary = json.loads((out / "summary.json").read_text())
     assert (summary["state"], summary["is_complete"]) == ("complete", False)
     assert summary["errors"]
+
+
+def test_all_files_that_are_not_whole_are_named(
+    room: SyntheticRecording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    close = RunBag.close
+
+    def tear(bag: RunBag) -> None:
+        close(bag)
+        raise RecordingError("run.mcap: torn")
+
+    monkeypatch.setattr(RunBag, "close", tear)
+    monkeypatch.setattr("gvo.viz.video._count_packets", lambda _: 0)
+    bag, film = tmp_path / "run.mcap", tmp_path / "film.webm"
+    outputs = gvo.RunOutputs(bag=bag, overlay=film, report=False)
+    result = gvo.run_recording(room, tmp_path / "out", outputs=outputs)
+    assert not result.is_complete
+    assert sum("run.mcap: torn" in warning for warning in result.warnings) == 1
+    assert sum("film.webm: was not written whole" in warning for warning in result.warnings) == 1

@@ -10,7 +10,7 @@ from gvo.errors import ConfigurationError, RecordingError, write_faults
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import Source
 from gvo.io.run_folder.line_file import check_folder, check_new
-from gvo.runs.loop import Output, RunLoop
+from gvo.runs.loop import FileOutput, RunLoop
 from gvo.runs.outputs.frames import RunFrames
 
 
@@ -67,7 +67,7 @@ class RunOutputs:
             if not force:
                 check_new(self.plots, otherwise="--force to replace its plots")
 
-    def open(self, loop: RunLoop, stack: ExitStack) -> tuple[list[Output], list[str]]:
+    def open(self, loop: RunLoop, stack: ExitStack) -> tuple[list[FileOutput], list[str]]:
         """Open the files that are written as the run goes.
 
         Parameters
@@ -79,7 +79,7 @@ class RunOutputs:
 
         Returns
         -------
-        outputs : list of Output
+        outputs : list of FileOutput
         warnings : list of str
             Where another file is written than asked for, a line each.
 
@@ -90,7 +90,7 @@ class RunOutputs:
         RecordingError
             When a file cannot be written.
         """
-        outputs: list[Output] = []
+        outputs: list[FileOutput] = []
         warnings: list[str] = []
         if self.plots is not None:
             with write_faults(RecordingError, self.plots):
