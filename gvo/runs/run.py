@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,7 @@ from gvo.io.poses.inputs import (
 from gvo.io.poses.truth import Truth, TruthComparison
 from gvo.io.recording import Source
 from gvo.io.run_folder.reader import read_run, trajectory_names
-from gvo.io.run_folder.writer import GLOBAL, PICTURE, REPORT, RunFolder, written_alone
+from gvo.io.run_folder.writer import GLOBAL, PICTURE, REPORT, RunFolder, save_summary, written_alone
 from gvo.runs.loop import FileOutput, Output, RunLoop, motions_of_window
 from gvo.runs.outputs.options import RunOutputs
 from gvo.runs.summary import RunningSummary, optimum_json, run_identity, summarize
@@ -290,7 +290,10 @@ def drawn(result: RunResult, folder: Path, *, plots: Path | None = None) -> RunR
         _draw(folder, plots=plots)
     except (GvoError, OSError) as error:
         warnings = (*result.warnings, f"not all was drawn: {error}")
-        result = replace(result, is_complete=False, warnings=warnings)
+        summary = result.summary | {"is_complete": False, "warnings": list(warnings)}
+        with suppress(OSError):
+            save_summary(folder, summary)
+        result = replace(result, summary=summary, is_complete=False, warnings=warnings)
     page = folder / REPORT
     return replace(result, report=page if page.exists() else None)
 

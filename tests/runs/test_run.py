@@ -368,6 +368,22 @@ def test_a_film_that_is_not_whole_takes_nothing_from_the_run(
     assert summary["errors"]
 
 
+def test_a_report_that_cannot_be_drawn_is_told_in_the_summary_too(
+    room: SyntheticRecording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError("no space")
+
+    monkeypatch.setattr("gvo.viz.report.write_run_report", fail)
+    result = gvo.run_recording(room, tmp_path)
+    assert result.report is None
+    assert result.warnings == ("not all was drawn: no space",)
+    assert not result.is_complete
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert (summary["state"], summary["is_complete"]) == ("complete", False)
+    assert summary["warnings"] == list(result.warnings)
+
+
 def test_all_files_that_are_not_whole_are_named(
     room: SyntheticRecording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

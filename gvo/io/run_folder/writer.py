@@ -306,10 +306,8 @@ class RunFolder(AbstractContextManager["RunFolder"]):
 
     def write_summary(self, summary: dict[str, Any]) -> None:
         """Replace `summary.json` atomically."""
-        text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
-        path = self.path / SUMMARY
-        with self._refused_on_error(path):
-            replace_text(path, text)
+        with self._refused_on_error(self.path / SUMMARY):
+            save_summary(self.path, summary)
 
     def discard(self) -> None:
         """Remove the files of a run that gave nothing."""
@@ -335,6 +333,12 @@ class RunFolder(AbstractContextManager["RunFolder"]):
     def _close_files(self) -> None:
         for file in self._files.values():
             file.close()
+
+
+def save_summary(folder: Path, summary: dict[str, Any]) -> None:
+    """Replace `summary.json` of a run folder atomically."""
+    text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
+    replace_text(folder / SUMMARY, text)
 
 
 def _link_rows(result: FrameResult) -> Iterator[Sequence[object]]:
