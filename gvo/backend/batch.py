@@ -392,6 +392,7 @@ class BatchOptimizer:
     error : float
         Of the poses so far.
     n_iterations : int
+    is_converged : bool
     refused : list of Link
         Edges that graduated non-convexity leaves out.
     """
@@ -416,7 +417,7 @@ class BatchOptimizer:
             self.raw.insert(key, chained[key])
             self.values.insert(key, chained[key] if T is None else gtsam.Pose3(T))
         self.refused: list[Link] = []
-        self.n_iterations = 0
+        self.n_iterations, self.is_converged = 0, True
         self.starts: dict[str, float] = {}
         self._choose_start(is_given=bool(graph.given))
 
@@ -479,17 +480,20 @@ class BatchOptimizer:
             if self._is_graduated and self._doubted:
                 self._graduate()
             if not only_refuse:
-                self._descend(_MAX_ITERATIONS)
+                self.is_converged = self._descend(_MAX_ITERATIONS)
         except RuntimeError as error:
             raise SmoothingError(f"GTSAM: {first_line(error)}") from error
         if fault := place_fault(self.poses()[:, :3, 3]):
             raise SmoothingError(f"GTSAM: {fault}")
 
-    def _descend(self, n_steps: int) -> None:
+    def _descend(self, n_steps: int) -> bool:
+        """Descend at most so many steps; tell whether the error has converged."""
+        before = self.error
         for values, error in descend(self._factors, self.values, n_steps=n_steps):
-            self.values, self.error = values, error
+            self.values, before, self.error = values, self.error, error
             self.n_iterations += 1
             self._on_step(f"iteration {self.n_iterations}: error {self.error:.6g}")
+        return not before - self.error > _TOLERANCE * before
 
     def _graduate(self) -> None:
         """Find out which of the doubted edges count, by a cost that becomes ever sharper."""

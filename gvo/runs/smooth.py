@@ -491,6 +491,10 @@ def optimize_edges(
                 found = optimizer.covariances() if covariances else None
             except SmoothingError as error:
                 notes.warnings.append(str(error))
+        except KeyboardInterrupt:
+            stopped = {"state": "interrupted", "warnings": ["interrupted"]}
+            folder.write_summary(_batch_summary(graph, optimizer, robust, notes) | stopped)
+            raise
         finally:
             # Also where the work is interrupted.
             smoothed = optimizer.trajectory(found)
@@ -549,6 +553,11 @@ def _rows(graph: WholeGraph, optimizer: BatchOptimizer) -> Iterator[tuple[object
 def _left_out(graph: WholeGraph, optimizer: BatchOptimizer) -> Iterator[str]:
     if graph.rejected:
         yield f"{len(graph.rejected)} edges or priors were refused; the first: {graph.rejected[0]}"
+    if not optimizer.is_converged:
+        yield (
+            f"stopped after {optimizer.n_iterations} iterations, while the error still falls: "
+            "where few measurements contradict each other, --robust none converges"
+        )
     n_left_out = len(graph.frame_ids) - len(optimizer.numbers)
     if n_left_out:
         yield (

@@ -245,6 +245,31 @@ def test_a_graph_optimized_onto_a_full_disk_says_how_many_poses_stand(
     assert not list(out.glob("*.new"))
 
 
+def test_a_graph_that_is_interrupted_says_so_beside_the_best_poses(tmp_path: Path) -> None:
+    graph = gtsam.findExampleDataFile("pose3example-grid.txt")  # type: ignore[no-untyped-call]
+
+    def stop(state: str) -> None:
+        if state.startswith("iteration 2"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        optimize_edges(open_edges([Path(graph)]), tmp_path, on_step=stop)
+    summary = summary_of(tmp_path)
+    assert (summary["state"], summary["batch"]["iterations"]) == ("interrupted", 2)
+    assert len(gvo.read_trajectory(tmp_path / "smoothed.txt")) == summary["frames"]
+
+
+def test_a_graph_whose_error_still_falls_is_not_complete(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    graph = gtsam.findExampleDataFile("pose3example-grid.txt")  # type: ignore[no-untyped-call]
+    assert optimize_edges(open_edges([Path(graph)]), tmp_path / "whole").is_complete
+    monkeypatch.setattr("gvo.backend.batch._MAX_ITERATIONS", 1)
+    result = optimize_edges(open_edges([Path(graph)]), tmp_path / "part")
+    assert not result.is_complete
+    assert "stopped after 1 iterations" in result.warnings[0]
+
+
 class _FullDisk:
     """Files of a disk on which one of them cannot grow beyond a size."""
 
