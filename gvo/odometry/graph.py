@@ -40,6 +40,7 @@ from gvo.backend.batch import INLIER_CHI2, BatchOptimizer, LocalGraph, WholeGrap
 from gvo.backend.factors import ORIGIN, Factors
 from gvo.backend.motion_model import MAX_EXTRAPOLATION_S, predict_step
 from gvo.config import WindowConfig
+from gvo.errors import SmoothingError
 from gvo.geometry import se3
 from gvo.io.run_folder.line_file import append_whole
 from gvo.odometry.keyframes import chi2
@@ -583,12 +584,10 @@ class RunGraph:
         Raises
         ------
         SmoothingError
-            If GTSAM fails.
-        ValueError
-            If the graph is empty.
+            If GTSAM fails, or the graph is empty.
         """
         if not self._keyframes:
-            raise ValueError("the graph of the run is empty: no frame has come (loops.enabled)")
+            raise SmoothingError("the graph of the run is empty: no frame has come (loops.enabled)")
         graph = self._copied()
         poses, _, reasons, error_before, optimizer, firsts = graph._solve(on_step)
         loops = tuple(

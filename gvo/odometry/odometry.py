@@ -230,9 +230,7 @@ class Odometry:
         Raises
         ------
         SmoothingError
-            When GTSAM fails.
-        ValueError
-            Before the first frame, and where `loops.enabled` is false.
+            When GTSAM fails; before the first frame, and where `loops.enabled` is false.
         """
         return self._graph.optimize()
 

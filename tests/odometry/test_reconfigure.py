@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gvo.config import Config
+from gvo.errors import SmoothingError
 from gvo.frontend.descriptor import DescriptorFrontend
 from gvo.frontend.klt import KltFrontend
 from gvo.io.frames import frames
@@ -283,7 +284,7 @@ def test_the_map_begins_where_loops_are_enabled() -> None:
     odometry = odometry_of("stereo", change(Config(), loops={"enabled": False}))
     for frame in items[:4]:
         odometry.track(frame)
-    with pytest.raises(ValueError, match=r"no frame has come \(loops.enabled\)"):
+    with pytest.raises(SmoothingError, match=r"no frame has come \(loops.enabled\)"):
         odometry.optimize()
     odometry.reconfigure(Config())
     for frame in items[4:]:
