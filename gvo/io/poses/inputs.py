@@ -24,7 +24,7 @@ from gvo.io.poses.ground_truth import (
     read_bag_truth,
 )
 from gvo.io.poses.tf import TfBuffer, read_tf
-from gvo.io.poses.truth import Truth, in_frame
+from gvo.io.poses.truth import Truth
 from gvo.io.recording import Source
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
@@ -36,7 +36,7 @@ CAMERA_CHANGED = (
 """What follows where a `CameraInfo` changes on the way, and what to do."""
 _MARK = "#"
 # A run's bag writes the robot's frames with the name of the estimate before theirs.
-_OWN_FRAME = re.compile(r"^gvo/(raw|causal|smoothed)/")
+_OWN_FRAME = re.compile(r"^gvo/(raw|causal|smoothed|global|odom)/")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -104,7 +104,7 @@ def read_pose_input(text: str, *, frame: str = "") -> PoseInput:
     )
     if not frame or found.child_frame in ("", frame):
         return found
-    return _brought(found, truth, reader, frame)
+    return _brought(found, reader, truth.child_frame, frame)
 
 
 def _repeats(name: str, trajectory: Trajectory) -> str:
@@ -126,16 +126,20 @@ def _read(reader: BagReader, what: str, path: str) -> BagTruth:
     raise RecordingError(f"{path}: name the poses: {', '.join(f'{path}#{name}' for name in held)}")
 
 
-def _brought(found: PoseInput, truth: BagTruth, reader: BagReader, frame: str) -> PoseInput:
+def _brought(found: PoseInput, reader: BagReader, child: str, frame: str) -> PoseInput:
     """Return poses of another frame of the same body; as they are where that cannot be done."""
-    reason = "positions without rotations cannot be moved"
-    if truth.trajectory.has_rotations:
-        tree = read_tf(reader, frames=(truth.child_frame, frame))
-        framed = in_frame(truth, tree, base_frame=frame)
-        if not isinstance(framed, Failure):
-            return replace(found, trajectory=framed.trajectory, child_frame=frame)
-        reason = framed.reason
-    apart = f"{found.name} is of {truth.child_frame}, the reference of {frame}: {reason}"
+    trajectory, reason = found.trajectory, "positions without rotations cannot be moved"
+    if trajectory.has_rotations:
+        own = _OWN_FRAME.match(child)
+        asked = f"{own[0]}{frame}" if own else frame
+        tree = read_tf(reader, frames=(child, asked))
+        T_child_asked, is_known = tree.lookup_many(child, asked, trajectory.stamps_ns)
+        if np.any(is_known):
+            known = trajectory.select(is_known)
+            poses = known.T_world_frame @ T_child_asked[is_known]
+            return replace(found, trajectory=replace(known, T_world_frame=poses), child_frame=frame)
+        reason = "tf does not connect the two"
+    apart = f"{found.name} is of {child}, the reference of {frame}: {reason}"
     return replace(found, warning="; ".join(filter(None, [found.warning, apart])))
 
 

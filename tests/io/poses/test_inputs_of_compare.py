@@ -15,6 +15,7 @@ from tests.io import camera_bags
 from tests.io.pose_bags import ODOMETRY, STAMPED, PoseBag
 
 T_BASE_CAM = se3.exp(np.array([0.4, -0.8, 1.0, 0.3, 0.1, 0.5]))
+RUN_NAMES = ("raw", "causal", "smoothed", "global", "odom")
 MOTION = se3.exp(np.outer(np.arange(8), [0.1, 0.0, -0.2, 1.0, 0.5, 0.1]))
 
 
@@ -32,6 +33,18 @@ def bag(tmp_path: Path) -> Path:
         bag.pose("/slam", ODOMETRY, n * 10**8, T @ T_BASE_CAM, child="cam")
         bag.pose("/gt", STAMPED, n * 10**8, T)
         bag.fix(n * 10**8, [48.0, 11.0, float(n)], frame="gps")
+    return bag.write()
+
+
+@pytest.fixture
+def run_bag(tmp_path: Path) -> Path:
+    """Return what a run with `--frame base` writes: frames of its own for each estimate."""
+    bag = PoseBag(tmp_path / "run.bag")
+    for name in RUN_NAMES:
+        bag.tf(0, f"gvo/{name}/base", f"gvo/{name}/cam", T_BASE_CAM, is_static=True)
+        for n, T in enumerate(MOTION):
+            child = f"gvo/{name}/base"
+            bag.pose(f"/gvo/{name}/odometry", ODOMETRY, n * 10**8, T, child=child)
     return bag.write()
 
 
@@ -63,11 +76,22 @@ def test_poses_are_brought_to_the_frame_of_the_reference(bag: Path) -> None:
 def test_what_cannot_be_brought_to_the_frame_is_compared_with_a_warning(bag: Path) -> None:
     found = read_pose_input(f"{bag}#/slam", frame="vicon/drone")
     assert found.child_frame == "cam"
-    assert found.warning.startswith("/slam is of cam, the reference of vicon/drone: ")
+    apart = "/slam is of cam, the reference of vicon/drone: tf does not connect the two"
+    assert found.warning == apart
     fixes = read_pose_input(f"{bag}#/fix", frame="base")
     assert fixes.warning == (
         "/fix is of gps, the reference of base: positions without rotations cannot be moved"
     )
+
+
+@pytest.mark.parametrize("name", RUN_NAMES)
+def test_estimates_of_a_run_are_brought_by_the_frames_of_their_own(
+    run_bag: Path, name: str
+) -> None:
+    for frame, wanted in (("base", MOTION), ("cam", MOTION @ T_BASE_CAM)):
+        found = read_pose_input(f"{run_bag}#/gvo/{name}/odometry", frame=frame)
+        assert (found.child_frame, found.warning) == (frame, "")
+        np.testing.assert_allclose(found.trajectory.T_world_frame, wanted, atol=1e-9)
 
 
 def test_a_bag_by_itself_gives_the_truth_that_it_names(bag: Path) -> None:
