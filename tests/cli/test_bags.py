@@ -91,6 +91,19 @@ def test_a_run_in_the_frame_of_the_robot_lies_on_its_truth(
     assert json.loads(compared.out)["estimates"][0]["ate_m"] < 0.02
 
 
+def test_the_truth_of_the_camera_and_poses_of_the_robot_are_of_one_motion(
+    command: Command, robot_bag: Path, tmp_path: Path
+) -> None:
+    gvo.convert(Walk(has_truth=True), tmp_path / "walk.mcap")
+    texts = [str(tmp_path / "walk.mcap"), f"{robot_bag}#tf:map:base_link"]
+    for reference, estimate in (texts, texts[::-1]):
+        # the camera's own bag does not know the robot
+        is_brought = reference == texts[0]
+        answer = command("compare", reference, estimate, "--json")
+        assert answer.err.count("tf does not connect the two") == (not is_brought)
+        assert (json.loads(answer.out)["estimates"][0]["rpe_m"] < 1e-3) == is_brought
+
+
 def test_the_initial_pose_moves_all_poses(
     command: Command, walk_bag: Path, walk_run: Path, tmp_path: Path
 ) -> None:

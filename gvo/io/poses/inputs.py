@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from gvo._text import exists
-from gvo.errors import RecordingError, TrajectoryError
+from gvo.errors import GvoError, RecordingError, TrajectoryError
 from gvo.io.bag.reader import OLD_TF_TYPE, TF_TYPE, BagReader
 from gvo.io.bag.source import BagSource
 from gvo.io.opening import is_bag, open_recording
@@ -24,6 +24,7 @@ from gvo.io.poses.ground_truth import (
     read_bag_truth,
 )
 from gvo.io.poses.tf import TfBuffer, read_tf
+from gvo.io.poses.tf_paths import bare
 from gvo.io.poses.truth import Truth
 from gvo.io.recording import Source
 from gvo.trajectory.formats import read_trajectory
@@ -37,6 +38,8 @@ CAMERA_CHANGED = (
 _MARK = "#"
 # A run's bag writes the robot's frames with the name of the estimate before theirs.
 _OWN_FRAME = re.compile(r"^gvo/(raw|causal|smoothed|global|odom)/")
+# As a run's bag names the camera of a recording that does not.
+_CAMERA = "camera_optical"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -53,12 +56,15 @@ class PoseInput:
     warning : str
         What could not be read, or that they are of another frame than the reference; empty if
         none.
+    is_of_camera : bool
+        Whether that frame is the rectified camera of a recording, whatever its name.
     """
 
     name: str
     trajectory: Trajectory
     child_frame: str = ""
     warning: str = ""
+    is_of_camera: bool = False
 
 
 def is_in_bag(text: str) -> bool:
@@ -69,7 +75,7 @@ def is_in_bag(text: str) -> bool:
     return bool(mark) and exists(Path(path))
 
 
-def read_pose_input(text: str, *, frame: str = "") -> PoseInput:
+def read_pose_input(text: str, *, frame: str = "", is_camera: bool = False) -> PoseInput:
     """Read poses from a file, or out of a bag, with what is known about them.
 
     Parameters
@@ -78,6 +84,8 @@ def read_pose_input(text: str, *, frame: str = "") -> PoseInput:
         A file of poses, `BAG#tf:PARENT:CHILD`, `BAG#TOPIC`, or a bag that names its ground truth.
     frame : str
         The frame that the poses are to be of, by its name in the bag's tf; empty: as they are.
+    is_camera : bool
+        Whether that is the rectified camera of a recording: in a run's bag it is that of the run.
 
     Returns
     -------
@@ -95,16 +103,25 @@ def read_pose_input(text: str, *, frame: str = "") -> PoseInput:
     path, _, what = (text, "", "") if exists(Path(text)) else text.partition(_MARK)
     reader = BagReader(Path(path))
     truth = _read(reader, what, path)
+    child = _camera_frame(path) if truth.is_of_camera else truth.child_frame
     found = PoseInput(
         name=what or Path(path).stem,
         trajectory=truth.trajectory,
-        # what is named ground truth is of the camera, whatever frame it has
-        child_frame="" if truth.is_of_camera else _OWN_FRAME.sub("", truth.child_frame),
+        child_frame=_OWN_FRAME.sub("", child),
         warning=reader.damage,
+        is_of_camera=truth.is_of_camera,
     )
-    if not frame or found.child_frame in ("", frame):
+    is_same = found.child_frame in ("", frame) or (found.is_of_camera and is_camera)
+    if not frame or is_same:
         return found
-    return _brought(found, reader, truth.child_frame, frame)
+    return _brought(found, reader, child, frame, is_camera=is_camera)
+
+
+def _camera_frame(path: str) -> str:
+    try:
+        return bare(open_recording(path).info.frame_id) or _CAMERA
+    except GvoError:  # its poses can be compared without its camera
+        return _CAMERA
 
 
 def _repeats(name: str, trajectory: Trajectory) -> str:
@@ -126,12 +143,13 @@ def _read(reader: BagReader, what: str, path: str) -> BagTruth:
     raise RecordingError(f"{path}: name the poses: {', '.join(f'{path}#{name}' for name in held)}")
 
 
-def _brought(found: PoseInput, reader: BagReader, child: str, frame: str) -> PoseInput:
+def _brought(
+    found: PoseInput, reader: BagReader, child: str, frame: str, *, is_camera: bool
+) -> PoseInput:
     """Return poses of another frame of the same body; as they are where that cannot be done."""
     trajectory, reason = found.trajectory, "positions without rotations cannot be moved"
     if trajectory.has_rotations:
-        own = _OWN_FRAME.match(child)
-        asked = f"{own[0]}{frame}" if own else frame
+        asked = _frame_of_run(reader, child, frame, is_camera=is_camera)
         tree = read_tf(reader, frames=(child, asked))
         T_child_asked, is_known = tree.lookup_many(child, asked, trajectory.stamps_ns)
         if np.any(is_known):
@@ -141,6 +159,18 @@ def _brought(found: PoseInput, reader: BagReader, child: str, frame: str) -> Pos
         reason = "tf does not connect the two"
     apart = f"{found.name} is of {child}, the reference of {frame}: {reason}"
     return replace(found, warning="; ".join(filter(None, [found.warning, apart])))
+
+
+def _frame_of_run(reader: BagReader, child: str, frame: str, *, is_camera: bool) -> str:
+    """Return a frame by its name in the tf of a run's bag; as it is where this is no run's."""
+    own = _OWN_FRAME.match(child)
+    if own is None:
+        return frame
+    if not is_camera:
+        return f"{own[0]}{frame}"
+    # the camera is all that a run mounts on its base frame
+    mounted = [name for parent, name in read_tf(reader, frames=()).edges if parent == child]
+    return mounted[0] if mounted else child
 
 
 def find_base_frame(
@@ -289,15 +319,21 @@ def read_compared(
     """
     if is_in_bag(reference):
         first = read_pose_input(reference)
-        truth, frame, warnings = first.trajectory, first.child_frame, [first.warning]
     else:
-        truth, frame = read_ground_truth(reference), ""
-        warnings = [_repeats(reference, truth)]
-    found = [read_pose_input(text, frame=frame) for text in estimates]
-    warnings += [one.warning for one in found]
+        truth, is_camera = read_ground_truth(reference), Path(reference).is_dir()
+        first = PoseInput(
+            name=reference,
+            trajectory=truth,
+            child_frame=_CAMERA if is_camera else "",
+            warning=_repeats(reference, truth),
+            is_of_camera=is_camera,
+        )
+    frame, is_camera = first.child_frame, first.is_of_camera
+    found = [read_pose_input(text, frame=frame, is_camera=is_camera) for text in estimates]
+    warnings = [one.warning for one in (first, *found) if one.warning]
     names = _short_names(estimates, [one.name for one in found])
     trajectories = {name: one.trajectory for name, one in zip(names, found, strict=True)}
-    return truth, trajectories, [warning for warning in warnings if warning]
+    return first.trajectory, trajectories, warnings
 
 
 def read_ground_truth(path: str | Path) -> Trajectory:

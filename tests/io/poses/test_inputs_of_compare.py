@@ -7,7 +7,7 @@ import pytest
 
 from gvo.errors import GvoError, RecordingError, TrajectoryError
 from gvo.geometry import se3
-from gvo.io.poses.inputs import is_in_bag, read_pose_input
+from gvo.io.poses.inputs import is_in_bag, read_compared, read_pose_input
 from gvo.trajectory.evaluation import Evaluation, evaluate
 from gvo.trajectory.formats import write_tum
 from gvo.trajectory.trajectory import Trajectory
@@ -92,6 +92,58 @@ def test_estimates_of_a_run_are_brought_by_the_frames_of_their_own(
         found = read_pose_input(f"{run_bag}#/gvo/{name}/odometry", frame=frame)
         assert (found.child_frame, found.warning) == (frame, "")
         np.testing.assert_allclose(found.trajectory.T_world_frame, wanted, atol=1e-9)
+
+
+@pytest.fixture(params=["folder", "bag"])
+def of_camera(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+    """Return a recording whose truth is that of its camera, and which names no frame of it."""
+    stamps_ns, T_world_cam = np.arange(8) * 10**8, MOTION @ T_BASE_CAM
+    if request.param == "folder":
+        path = tmp_path / "tum" / "groundtruth.txt"
+        path.parent.mkdir()
+        write_tum(path, Trajectory(stamps_ns=stamps_ns, T_world_frame=T_world_cam))
+        return path.parent
+    bag = PoseBag(tmp_path / "truth.bag")
+    for stamp_ns, T in zip(stamps_ns.tolist(), T_world_cam, strict=True):
+        bag.tf(stamp_ns, "world", "ground_truth", T)
+    return bag.write()
+
+
+def test_a_run_of_the_base_is_brought_to_the_camera_of_the_truth(
+    of_camera: Path, run_bag: Path
+) -> None:
+    names = [f"{run_bag}#/gvo/{name}/odometry" for name in RUN_NAMES]
+    truth, estimates, warnings = read_compared(str(of_camera), names)
+    assert (len(estimates), warnings) == (5, [])
+    for estimate in estimates.values():
+        np.testing.assert_allclose(estimate.T_world_frame, truth.T_world_frame, atol=1e-8)
+
+
+def test_a_run_of_the_camera_stays_as_it_is(of_camera: Path, tmp_path: Path) -> None:
+    bag = PoseBag(tmp_path / "plain.bag")
+    for n, T in enumerate(MOTION @ T_BASE_CAM):
+        bag.pose("/odom", ODOMETRY, n * 10**8, T, child="gvo/causal/cam")
+        bag.pose("/pose", STAMPED, n * 10**8, T)
+    path = bag.write()
+    texts = [f"{path}#/odom", f"{path}#/pose", *([str(of_camera)] * of_camera.is_file())]
+    truth, estimates, warnings = read_compared(str(of_camera), texts)
+    assert warnings == []
+    for estimate in estimates.values():
+        np.testing.assert_allclose(estimate.T_world_frame, truth.T_world_frame, atol=1e-9)
+
+
+def test_what_is_not_of_the_camera_of_the_truth_is_compared_with_a_warning(
+    of_camera: Path, bag: Path
+) -> None:
+    texts = [f"{bag}#/odom", f"{bag}#/slam", f"{bag}#/fix"]
+    _, estimates, warnings = read_compared(str(of_camera), texts)
+    assert warnings == [
+        "/odom is of base, the reference of camera_optical: tf does not connect the two",
+        "/slam is of cam, the reference of camera_optical: tf does not connect the two",
+        "/fix is of gps, the reference of camera_optical: positions without rotations cannot be "
+        "moved",
+    ]
+    np.testing.assert_allclose(estimates["/odom"].T_world_frame, MOTION, atol=1e-9)
 
 
 def test_a_bag_by_itself_gives_the_truth_that_it_names(bag: Path) -> None:
