@@ -458,6 +458,31 @@ def consistency(truth: Trajectory, motions: Motions) -> Consistency | None:
     )
 
 
+def truth_jump(truth: Trajectory, estimate: Trajectory) -> float | None:
+    """Return by how much the noise of true positions moves them from frame to frame, metres.
+
+    Of how a step differs from the one before, the motion is in both trajectories; what of it the
+    truth has alone is its own noise, what the estimate has alone is not counted.
+
+    Returns
+    -------
+    float or None
+        None for fewer than three poses in common, or without rotations.
+    """
+    if not _have_rotations(truth, estimate):
+        return None
+    true = truth.interpolate(estimate.stamps_ns, max_gap_ns=MAX_GAP_NS)
+    poses = estimate.select(np.isin(estimate.stamps_ns, true.stamps_ns)).T_world_frame
+    if len(poses) < _MIN_POSES:
+        return None
+    true_steps, steps = (se3.invert(T[:-1]) @ T[1:] for T in (true.T_world_frame, poses))
+    changes, others = (np.diff(each[:, :3, 3], axis=0) for each in (true_steps, steps))
+    # the median, as an estimate that is lost does not share the motion; noise of a position has
+    # the variance 2 in a step, 6 in the difference of two
+    shared = np.median(np.sum(changes * (changes - others), axis=1))
+    return float(np.sqrt(max(shared, 0.0) / 3.0))
+
+
 def _is_positive(covariances: FloatArray) -> BoolArray:
     # normalized by the sigmas: metres and radians have different scales
     variances = np.diagonal(covariances, axis1=1, axis2=2)

@@ -101,6 +101,7 @@ def test_summary_tells_the_path_and_how_the_covariances_fit(run_dir: Path) -> No
     truth = gvo.read_trajectory(run_dir / "ground_truth.txt")
     assert summary["path_m"] == pytest.approx(truth.distances()[-1], rel=0.01)
     assert summary["extent_m"] == pytest.approx(summary["path_m"], rel=0.1)
+    assert 0.0 <= summary["truth_jump_m"] < 1e-3  # it is exact
     rows = summary["covariances"]
     assert [row["motion"] for row in rows] == ["window over 1 s", "raw over 1 s"]
     assert [row["n"] for row in rows] == [1, 10]

@@ -17,10 +17,16 @@ from hypothesis import given
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
 from gvo.trajectory.alignment import AlignMode, Similarity
-from gvo.trajectory.evaluation import Evaluation, evaluate, relative_errors, segment_errors
+from gvo.trajectory.evaluation import (
+    Evaluation,
+    evaluate,
+    relative_errors,
+    segment_errors,
+    truth_jump,
+)
 from gvo.trajectory.formats import read_trajectory, write_kitti, write_tum
 from gvo.trajectory.trajectory import Trajectory
-from tests.trajectory.paths import seeds, straight
+from tests.trajectory.paths import seeds, straight, unturned
 
 
 def drive(n: int, step_m: float = 1.0, *, seed: int = 0) -> Trajectory:
@@ -388,3 +394,39 @@ def test_a_truth_of_one_fix_a_second_measures_the_drive() -> None:
     assert found.n == 60
     assert found.ate_m == pytest.approx(evaluate(reference, estimate, name="e").ate_m, rel=0.05)
     np.testing.assert_array_equal(found.stamps_ns, fixes.stamps_ns)
+
+
+def shaken(*, noise_m: float = 0.0, seed: int = 0) -> Trajectory:
+    """Return 300 poses of a camera in a shaking hand; their own noise is independent."""
+    phases = np.outer(np.arange(300), [0.31, 0.23, 0.17])
+    noise = np.random.default_rng(seed).normal(scale=noise_m, size=phases.shape)
+    poses = unturned(0.2 * np.sin(phases) + noise)
+    return Trajectory(stamps_ns=np.arange(300) * 33_000_000, T_world_frame=poses)
+
+
+@pytest.mark.parametrize("estimated_m", [0.0, 1e-3, 3e-3])
+def test_the_jump_of_the_truth_is_its_own_noise_and_not_that_of_the_estimate(
+    estimated_m: float,
+) -> None:
+    estimate = shaken(noise_m=estimated_m, seed=1)
+    # a step is the difference of two positions of three axes each
+    assert truth_jump(shaken(noise_m=1e-2), estimate) == pytest.approx(6**0.5 * 1e-2, rel=0.3)
+    jump_m = truth_jump(shaken(), estimate)
+    assert jump_m is not None
+    assert jump_m < 1e-3
+
+
+def test_a_truth_does_not_jump_where_the_estimate_is_lost() -> None:
+    truth = shaken()
+    poses = np.concatenate(
+        [truth.T_world_frame[:220], np.tile(truth.T_world_frame[219], (80, 1, 1))]
+    )
+    estimate = Trajectory(stamps_ns=truth.stamps_ns, T_world_frame=poses)
+    assert truth_jump(truth, estimate) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_jump_of_the_truth_needs_three_poses_with_rotations() -> None:
+    truth = straight(5)
+    assert truth_jump(truth, truth.select(slice(2))) is None
+    assert truth_jump(truth, truth.select(slice(3))) == pytest.approx(0.0, abs=1e-9)
+    assert truth_jump(Trajectory.of_positions(truth.stamps_ns, truth.positions), truth) is None

@@ -486,8 +486,8 @@ def _how_sure(summary: Mapping[str, Any]) -> str:
     if factor <= _FIT_FACTOR or row["nees"] <= row["nees_high"]:
         return "covariances fit"
     # Noise of the true poses is as large from frame to frame; errors of a motion add up.
-    jump_m = next((each["rpe_m"] for each in summary["errors"] if each["name"] == "smoothed"), None)
-    if (jump_m or 0.0) > 0.5 * row["error_m"]:
+    jump_m = summary.get("truth_jump_m") or 0.0
+    if jump_m > 0.5 * row["error_m"]:
         return f"covariances cannot be judged, the truth jumps by {jump_m:.2g} m between frames"
     return (
         f"covariances too small, {factor:.2g} times in sigma, unless the truth itself is off by "

@@ -27,6 +27,7 @@ def summary(**changes: Any) -> dict[str, Any]:
             {"name": name, "n": 393, "ate_m": ate_m, "rpe_m": 0.004}
             for name, ate_m in (("raw", 0.52), ("smoothed", 0.304))
         ],
+        "truth_jump_m": 0.004,
         "covariances": [row(1.1), row(7.0, motion="raw over 1 s")],
         "rig_offsets": None,
         "warnings": [],
@@ -154,7 +155,7 @@ FIT = "covariances fit"
             "covariances too small, 18 times in sigma, unless the truth itself is off by 0.091 m "
             "and 0.1 deg over 1 s",
         ),
-        # the error over a second is hardly larger than that from one frame to the next
+        # the error over a second is hardly larger than what the truth jumps by between frames
         (
             row(25.0, error_m=0.006),
             "covariances cannot be judged, the truth jumps by 0.004 m between frames",
@@ -167,6 +168,14 @@ FIT = "covariances fit"
 def test_the_verdict_judges_the_covariances(found: dict[str, Any], words: str) -> None:
     said = verdict(summary(covariances=[found]))
     assert said == f"298 m in 393 frames, all tracked; 0.3 m from the truth; {words}."
+
+
+@pytest.mark.parametrize("jump_m", [None, 0.001])
+def test_an_estimate_that_zigzags_is_no_jump_of_the_truth(jump_m: float | None) -> None:
+    errors = [{"name": "smoothed", "n": 393, "ate_m": 0.304, "rpe_m": 0.0067}]
+    found = [row(25.0, error_m=0.006)]
+    said = verdict(summary(errors=errors, covariances=found, truth_jump_m=jump_m))
+    assert "covariances too small, 5 times in sigma, unless the truth itself is off by" in said
 
 
 @pytest.mark.parametrize(
