@@ -113,15 +113,16 @@ def _figure_of_errors(
 
 def _figure_of_positions(estimates: Mapping[str, Trajectory]) -> Figure:
     start = min(estimates.values(), key=lambda estimate: int(estimate.stamps_ns[0]))
+    plane = ground_plane(next(iter(estimates.values())))
     figure = _new_figure(_SIZE_INCHES)
     axes = figure.subplot_mosaic([["view", axis] for axis in "xyz"])
     view, panels = axes["view"], [axes[axis] for axis in "xyz"]
     for (name, estimate), style in zip(estimates.items(), styles_of(estimates), strict=True):
-        _draw_path(view, estimate, (0, 2), style, plain(name))
+        _draw_path(view, estimate, plane, style, plain(name))
         elapsed_s = elapsed(estimate.stamps_ns, int(start.stamps_ns[0]))
         for axis, panel in enumerate(panels):
             _draw_values(panel, elapsed_s, estimate.positions[:, axis], style)
-    _mark_start(view, start, (0, 2))
+    _mark_start(view, start, plane)
     for letter, panel in zip("xyz", panels, strict=True):
         panel.set_ylabel(f"{letter} [m]")
         panel.tick_params(labelbottom=letter == "z")
@@ -361,13 +362,8 @@ def is_of_camera(reference: Trajectory) -> bool:
 
 
 def ground_plane(reference: Trajectory) -> tuple[int, int]:
-    """Return the axes to draw: x and z with camera axes, else the two of largest extent."""
-    if is_of_camera(reference):
-        return 0, 2
-    extents = np.ptp(reference.positions, axis=0)
-    least = 2 - int(np.argmin(extents[::-1]))  # the last of equal ones: z is up in most worlds
-    horizontal, vertical = (axis for axis in range(3) if axis != least)
-    return horizontal, vertical
+    """Return the horizontal axes: x and z with camera axes, else x and y, z up."""
+    return (0, 2) if is_of_camera(reference) else (0, 1)
 
 
 def plain(name: str) -> str:

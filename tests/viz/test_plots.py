@@ -13,6 +13,7 @@ from gvo.errors import ConfigurationError, TrajectoryError
 from gvo.geometry import se3
 from gvo.trajectory.trajectory import Trajectory
 from gvo.viz.plots import plot_trajectories
+from gvo.viz.report.paths import World
 
 BLACK, RAW, CAUSAL, SMOOTHED, FREE = (
     (0, 0, 0),
@@ -69,17 +70,30 @@ def test_equal_input_gives_equal_files(tmp_path: Path) -> None:
     ("extents", "start", "axes"),
     [
         ((3.0, 9.0, 5.0), 0.0, "xz"),  # the world of a camera, whatever it did
+        # any other has z up, whatever was done in it
         ((3.0, 5.0, 0.2), 1.0, "xy"),
-        ((0.2, 5.0, 3.0), 1.0, "yz"),
-        ((3.0, 0.2, 5.0), 1.0, "xz"),
+        ((0.2, 5.0, 3.0), 1.0, "xy"),
+        ((3.0, 0.2, 5.0), 1.0, "xy"),
     ],
 )
-def test_the_view_shows_the_axes_of_most_motion(
+def test_the_view_is_from_above_as_that_of_the_report(
     tmp_path: Path, extents: tuple[float, float, float], start: float, axes: str
 ) -> None:
     reference = curve(0, extents=extents, start=start)
     text = svg_text(tmp_path, reference, {"raw": curve(1, extents=extents)})
     assert "".join(axis for axis in "xyz" if f"<!-- {axis} [m] -->" in text) == axes
+    world = World.of(reference)
+    assert "".join("xyz"[axis] for axis in world.ground) == axes
+    assert ("xyz"[world.up], world.is_up_negative) == (
+        ("y", True) if axes == "xz" else ("z", False)
+    )
+
+
+def test_a_robot_without_truth_is_seen_from_above_too(tmp_path: Path) -> None:
+    """The panels beside have the axes as labels, the view has two of them once more."""
+    for extents, start, axes in (((3.0, 9.0, 5.0), 0.0, "xz"), ((3.0, 5.0, 0.2), 1.0, "xy")):
+        text = svg_text(tmp_path, None, {"raw": curve(0, extents=extents, start=start)})
+        assert "".join(axis for axis in "xyz" if text.count(f"<!-- {axis} [m] -->") == 2) == axes
 
 
 def test_labels_carry_units_names_and_errors(tmp_path: Path) -> None:

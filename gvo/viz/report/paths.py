@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
 from gvo.viz.palette import LOOP_STYLES, REFERENCE_STYLE, Style, styles_of
-from gvo.viz.plots import HOLLOW, is_of_camera, plain
+from gvo.viz.plots import HOLLOW, ground_plane, plain
 from gvo.viz.report.sheets import HALF, Plot, arrange, display_path, fit_left
 
 _HEIGHT = 4.8
@@ -46,9 +46,9 @@ class World:
     @classmethod
     def of(cls, reference: Trajectory) -> World:
         """Return y down for a world with camera axes, else z up."""
-        if is_of_camera(reference):
-            return cls(ground=(0, 2), up=1, is_up_negative=True)
-        return cls(ground=(0, 1), up=2, is_up_negative=False)
+        ground = ground_plane(reference)
+        up = 3 - sum(ground)
+        return cls(ground=ground, up=up, is_up_negative=up == 1)
 
     @property
     def words(self) -> str:
