@@ -31,13 +31,7 @@ from gvo.runs.loop import FileOutput, Output, RunLoop, motions_of_window
 from gvo.runs.outputs.options import RunOutputs
 from gvo.runs.summary import RunningSummary, optimum_json, run_identity, summarize
 from gvo.trajectory.alignment import MAX_DIFFERENCE_NS
-from gvo.trajectory.evaluation import (
-    Consistency,
-    Evaluation,
-    consistency,
-    motions_of_chain,
-    truth_jump,
-)
+from gvo.trajectory.evaluation import Consistency, Evaluation, consistency, motions_of_chain
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, Progress
@@ -242,16 +236,14 @@ def _measure(
     """Return the path, and how the covariances fit the truth, if there is one."""
     positions = read_trajectory(folder.path / "smoothed.txt")
     found: list[Consistency | None] = []
-    jump_m = None
     if isinstance(compared, TruthComparison):
         window = motions_of_window(loop.edges, name="window over 1 s")
         motions = [window, *motions_of_chain(compared.estimates["raw"])]
         found = [consistency(compared.truth.trajectory, each) for each in motions]
-        jump_m = truth_jump(compared.truth.trajectory, positions)
     return {
         "path_m": float(positions.distances()[-1]),
         "extent_m": float(np.linalg.norm(np.ptp(positions.positions, axis=0))),
-        "truth_jump_m": jump_m,
+        "truth_jump_m": compared.truth_jump_m if isinstance(compared, TruthComparison) else None,
         "covariances": [each.as_json() for each in found if each is not None],
     }
 

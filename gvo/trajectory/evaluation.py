@@ -469,11 +469,9 @@ def truth_jump(truth: Trajectory, estimate: Trajectory) -> float | None:
     float or None
         None for fewer than three poses in common, or without rotations.
     """
-    if not _have_rotations(truth, estimate):
-        return None
     true = truth.interpolate(estimate.stamps_ns, max_gap_ns=MAX_GAP_NS)
     poses = estimate.select(np.isin(estimate.stamps_ns, true.stamps_ns)).T_world_frame
-    if len(poses) < _MIN_POSES:
+    if len(poses) < _MIN_POSES or not _have_rotations(truth, estimate):
         return None
     true_steps, steps = (se3.invert(T[:-1]) @ T[1:] for T in (true.T_world_frame, poses))
     changes, others = (np.diff(each[:, :3, 3], axis=0) for each in (true_steps, steps))

@@ -111,10 +111,10 @@ def read_pose_input(text: str, *, frame: str = "", is_camera: bool = False) -> P
         warning=reader.damage,
         is_of_camera=truth.is_of_camera,
     )
-    is_same = found.child_frame in ("", frame) or (found.is_of_camera and is_camera)
-    if not frame or is_same:
+    if not frame or not child or (is_camera and truth.is_of_camera):
         return found
-    return _brought(found, reader, child, frame, is_camera=is_camera)
+    asked = _frame_of_run(reader, child, frame, is_camera=is_camera)
+    return found if asked == child else _brought(found, reader, child, asked)
 
 
 def _camera_frame(path: str) -> str:
@@ -143,13 +143,11 @@ def _read(reader: BagReader, what: str, path: str) -> BagTruth:
     raise RecordingError(f"{path}: name the poses: {', '.join(f'{path}#{name}' for name in held)}")
 
 
-def _brought(
-    found: PoseInput, reader: BagReader, child: str, frame: str, *, is_camera: bool
-) -> PoseInput:
+def _brought(found: PoseInput, reader: BagReader, child: str, asked: str) -> PoseInput:
     """Return poses of another frame of the same body; as they are where that cannot be done."""
     trajectory, reason = found.trajectory, "positions without rotations cannot be moved"
+    frame = _OWN_FRAME.sub("", asked)
     if trajectory.has_rotations:
-        asked = _frame_of_run(reader, child, frame, is_camera=is_camera)
         tree = read_tf(reader, frames=(child, asked))
         T_child_asked, is_known = tree.lookup_many(child, asked, trajectory.stamps_ns)
         if np.any(is_known):
@@ -164,13 +162,10 @@ def _brought(
 def _frame_of_run(reader: BagReader, child: str, frame: str, *, is_camera: bool) -> str:
     """Return a frame by its name in the tf of a run's bag; as it is where this is no run's."""
     own = _OWN_FRAME.match(child)
-    if own is None:
-        return frame
-    if not is_camera:
-        return f"{own[0]}{frame}"
-    # the camera is all that a run mounts on its base frame
-    mounted = [name for parent, name in read_tf(reader, frames=()).edges if parent == child]
-    return mounted[0] if mounted else child
+    if own and is_camera:
+        # all that a run mounts on its base frame
+        return next((c for p, c in read_tf(reader, frames=()).edges if p == child), child)
+    return f"{own[0]}{frame}" if own else frame
 
 
 def find_base_frame(
@@ -320,14 +315,10 @@ def read_compared(
     if is_in_bag(reference):
         first = read_pose_input(reference)
     else:
-        truth, is_camera = read_ground_truth(reference), Path(reference).is_dir()
-        first = PoseInput(
-            name=reference,
-            trajectory=truth,
-            child_frame=_CAMERA if is_camera else "",
-            warning=_repeats(reference, truth),
-            is_of_camera=is_camera,
-        )
+        truth = read_ground_truth(reference)
+        first = PoseInput(name=reference, trajectory=truth, warning=_repeats(reference, truth))
+        if Path(reference).is_dir():
+            first = replace(first, child_frame=_CAMERA, is_of_camera=True)
     frame, is_camera = first.child_frame, first.is_of_camera
     found = [read_pose_input(text, frame=frame, is_camera=is_camera) for text in estimates]
     warnings = [one.warning for one in (first, *found) if one.warning]

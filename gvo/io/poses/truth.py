@@ -12,7 +12,7 @@ from gvo.io.bag.reader import MessageReader
 from gvo.io.poses.ground_truth import BagTruth, BagTruthSpec, find_named_truth, read_bag_truth
 from gvo.io.poses.tf import TfBuffer, read_tf
 from gvo.io.poses.tf_paths import bare
-from gvo.trajectory.evaluation import Evaluation, evaluate
+from gvo.trajectory.evaluation import Evaluation, evaluate, truth_jump
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import BoolArray, Failure, FloatArray
 
@@ -249,6 +249,11 @@ class TruthComparison:
             evaluate(truth.trajectory, estimate, name=name) for name, estimate in comparable.items()
         )
         return cls(truth=truth, estimates=comparable, evaluations=evaluations)
+
+    @property
+    def truth_jump_m(self) -> float | None:
+        """By how much the truth jumps from frame to frame, metres; see `truth_jump`."""
+        return truth_jump(self.truth.trajectory, self.estimates["smoothed"])
 
     def warnings(self) -> list[str]:
         """Return caveats of the errors, a line each."""
