@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import json
 import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 
 import pandas as pd
@@ -16,13 +17,13 @@ from distributed import Client
 from gvo._version import __version__
 from gvo.batch.engine import BatchProgress, Engine, connected
 from gvo.batch.inputs import NamedRecording, Variant, differences, find_recordings, name_variants
-from gvo.batch.results import to_frame, write_results
+from gvo.batch.results import CSV, to_frame, write_results
 from gvo.batch.storage import Place, is_url, store
 from gvo.batch.tasks import MARK, BatchOptions, BatchRow, Task, TaskOptions
 from gvo.config import Config
 from gvo.errors import OutputError, write_faults
 from gvo.io.run_folder.line_file import check_new, replace_text
-from gvo.io.run_folder.writer import REPORT
+from gvo.io.run_folder.writer import REPORT, check_unused
 
 # How often the table is written while the batch runs.
 _EVERY_S = 10.0
@@ -95,8 +96,8 @@ def run_batch(
     on_progress: Callable[[BatchProgress], None] | None = None,
 ) -> pd.DataFrame:
     """Run recordings with named configurations; see `run`."""
-    check_plots(out, options)
     tasks = make_tasks(recordings, variants)
+    check_place(out, tasks, options)
     table = _Table(out, tasks, options.plots)
     shared = TaskOptions(out=table.location, mark=table.mark, batch=options)
     with ExitStack() as stack:
@@ -109,16 +110,41 @@ def run_batch(
     return table.frame()
 
 
-def check_plots(out: str | Path, options: BatchOptions) -> None:
-    """Refuse to replace the plots of another batch, before any work.
+def check_place(out: str | Path, tasks: Sequence[Task], options: BatchOptions) -> None:
+    """Refuse to replace results that are not of this batch, before any work.
 
     Raises
     ------
     RecordingError
         With what to do.
     """
-    if options.plots is not None and not (options.force or Place.of(f"{out}/{MARK}").exists()):
+    if options.force:
+        return
+    if Place.of(f"{out}/{MARK}").exists():
+        _check_rows(out, tasks)
+        return
+    if options.plots is not None:
         check_new(options.plots, otherwise="--force to replace its plots")
+    if not is_url(out):
+        for folder in ("", *(task.folder for task in tasks)):
+            check_unused(Path(out, folder))
+
+
+def _check_rows(out: str | Path, tasks: Sequence[Task]) -> None:
+    """Refuse a batch that would take runs out of the table that is there."""
+    table = Place.of(f"{out}/{CSV}")
+    if not table.exists():
+        return
+    with suppress(ValueError, KeyError):  # another's table, or damaged
+        rows = pd.read_csv(io.BytesIO(table.read()), dtype=str, keep_default_na=False)
+        there = rows["folder"][rows["status"] != "failed"]
+        gone = there[~there.isin(to_frame([task.row("failed") for task in tasks])["folder"])]
+        if len(gone):
+            raise OutputError(
+                f"{out}: holds another batch, whose runs would leave its table: {len(gone)}, the "
+                f"first {gone.iloc[0]}; run them too, give another folder by --out, or --force to "
+                "replace the table"
+            )
 
 
 def make_tasks(recordings: Sequence[NamedRecording], variants: Sequence[Variant]) -> list[Task]:

@@ -145,7 +145,7 @@ class BatchOptions:
     report : bool
         Draw the picture and the page of each run; those of the batch are always drawn.
     force : bool
-        Run what an earlier batch has finished again.
+        Run what an earlier batch has finished again, and replace other results.
     plots : Path, optional
         Folder for each plot of the batch's report as PNG and PDF; one that holds something is
         refused, unless `force` is set or the batch is one that goes on.

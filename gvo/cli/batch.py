@@ -48,7 +48,7 @@ def batch(
     scheduler: Annotated[
         str | None, Option(metavar="URL", help="Scheduler of a Dask cluster, as tcp://host:8786.")
     ] = None,
-    force: Annotated[bool, Option("--force", help="Run finished runs again.")] = False,
+    force: Annotated[bool, Option("--force", help="Run all again; replace other results.")] = False,
     excerpt: opt.Excerpt,
     with_report: Annotated[
         bool, Option("--report/--no-report", help="Draw the picture and page of each run.")
@@ -61,7 +61,7 @@ def batch(
     """Run many recordings or configurations: one table, one report."""
     from gvo.batch import BatchOptions, connected, find_recordings, make_variants, run_batch
     from gvo.batch.results import outcome
-    from gvo.batch.running import check_plots
+    from gvo.batch.running import check_place, make_tasks
     from gvo.io.calibration.files import paths_of
 
     if scheduler is not None and workers is not None:
@@ -77,7 +77,7 @@ def batch(
         force=force,
         plots=plots,
     )
-    check_plots(out, batch_options)
+    check_place(out, make_tasks(found, variants), batch_options)
     counts = _count(len(found), "recording"), _count(len(variants), "configuration")
     say(", ".join(counts))
     told = told_where_it_stands(out, and_then=": the same command goes on")

@@ -14,12 +14,20 @@ import pytest
 from distributed import Client
 
 import gvo
-from gvo.batch import BatchOptions, BatchProgress
-from gvo.batch.running import check_plots
+from gvo.batch import BatchProgress
 from gvo.cli.batch import _clock, _words
 from gvo.io.run_folder.reader import read_run
 from tests.batch.conftest import copy_of, is_complete, is_under_way, state_of, wait_until, walk
-from tests.conftest import GVO, Answer, Command, assert_same_files, is_one_line, python, refused
+from tests.conftest import (
+    GVO,
+    Answer,
+    Command,
+    assert_same_files,
+    is_one_line,
+    python,
+    refused,
+    run_of,
+)
 
 Batch = Callable[..., Answer]
 
@@ -91,10 +99,42 @@ def test_configurations_and_sweeps_are_all_pairs(
     assert {"boxes", "error_by_value", "front"} <= set(plots)
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in plots.values())
     # The same batch may go on; another one does not replace its plots.
-    check_plots("out", BatchOptions(plots=Path("plots")))
+    answer = batch(bag, "--out", "out", "--configs", *files, "--sweep", sweep, "--plots", "plots")
+    assert answer.code == 0, answer.err
     refused = batch(bag, "--out", "other", "--plots", "plots")
     words = "plots: exists already; give another path or --force to replace its plots"
     assert (refused.code, refused.out, refused.err) == (2, "", f"gvo: error: {words}\n")
+
+
+@pytest.mark.parametrize("folder", ["", "walk0"])
+def test_a_folder_that_holds_a_run_is_refused(
+    batch: Batch, bags: Path, tmp_path: Path, folder: str
+) -> None:
+    run_of(bags / "walk0.mcap", tmp_path / folder)
+    before = state_of(tmp_path)
+    words = ["--out", tmp_path, "--set", "window.size=3"]
+    assert "holds an earlier result (summary.json)" in refused(batch(bags / "walk0.mcap", *words))
+    assert state_of(tmp_path) == before
+    assert batch(bags / "walk0.mcap", *words, "--force").code == 0
+    # Now it is the batch's.
+    assert batch(bags / "walk0.mcap", *words).code == 0
+
+
+@pytest.mark.parametrize("is_remote", [False, True])
+def test_a_batch_does_not_take_runs_out_of_a_table(
+    batch: Batch, bags: Path, tmp_path: Path, memory: str, is_remote: bool
+) -> None:
+    (tmp_path / "broken.bag").write_text("no bag")
+    out: str | Path = memory if is_remote else tmp_path / "out"
+    words = ["--out", out, "--duration", "0.2"]
+    assert batch(*(bags / f"walk{n}.mcap" for n in (0, 1)), tmp_path / "broken.bag", *words).code
+    said = refused(batch(bags / "walk1.mcap", bags / "walk2.mcap", *words))
+    assert f"{out}: holds another batch, whose runs would leave its table: 1, the first" in said
+    assert " walk0; " in said
+    # One that failed leaves nothing but its row.
+    assert batch(bags, *words).code == 0
+    assert batch(bags / "walk2.mcap", *words, "--force").code == 0
+    assert batch(bags / "walk2.mcap", *words).code == 0
 
 
 def test_settings_and_excerpts_reach_the_runs(batch: Batch, bags: Path, tmp_path: Path) -> None:
