@@ -84,8 +84,9 @@ def demo(
     out: Annotated[Path, Option(metavar="DIR", help="Folder to write.")] = Path("gvo-demo"),
 ) -> None:
     """Render a drive as a bag, run on it, compare with the truth."""
-    from gvo.runs.demo import BAG_NAME, run_demo
+    from gvo.runs.demo import BAG_NAME, check_place, run_demo
 
+    check_place(out)
     say(f"rendering a drive into {out / BAG_NAME}")
     told = told_what_stands(f"what is done is in {out}; the same command begins anew")
     with at_work(told, progress("demo")) as work:

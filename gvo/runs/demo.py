@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -44,13 +45,17 @@ def write_demo_bags(folder: Path, *, progress: Callable[[int], None] | None = No
     RecordingError
         When a file cannot be written.
     """
-    drive = SyntheticRecording(world="driving", sensor="stereo", n_frames=N_FRAMES)
+    drive = _drive()
     with write_faults(RecordingError, folder):
         folder.mkdir(parents=True, exist_ok=True)
         for name in (BAG_NAME, ROBOT_NAME):
             (folder / name).unlink(missing_ok=True)
         write_robot_bag(drive.ground_truth(), folder / ROBOT_NAME)
     write_bag(drive, folder / BAG_NAME, progress=progress)
+
+
+def _drive() -> SyntheticRecording:
+    return SyntheticRecording(world="driving", sensor="stereo", n_frames=N_FRAMES)
 
 
 def write_robot_bag(truth: Trajectory, path: Path) -> None:
@@ -74,6 +79,26 @@ def write_robot_bag(truth: Trajectory, path: Path) -> None:
         bag.result.rename(path)
 
 
+def check_place(out: Path) -> None:
+    """Refuse a folder that holds something else, before any work.
+
+    That of an earlier demonstration is known by its `robot.mcap`, equal to the bit.
+
+    Raises
+    ------
+    RecordingError
+        With what to do.
+    """
+    with TemporaryDirectory() as fresh:
+        robot = Path(fresh) / ROBOT_NAME
+        write_robot_bag(_drive().ground_truth(), robot)
+        there = out / ROBOT_NAME
+        is_own = there.is_file() and filecmp.cmp(robot, there, shallow=False)
+    check_unused(out, force=is_own, otherwise="")
+    for name in () if is_own else (BAG_NAME, ROBOT_NAME):
+        check_new(out / name)
+
+
 def run_demo(
     out: Path,
     *,
@@ -86,8 +111,7 @@ def run_demo(
     Parameters
     ----------
     out : Path
-        Folder for the bags and the run's files. That of an earlier demonstration, known by its
-        `robot.mcap`, is made anew.
+        Folder for the bags and the run's files. That of an earlier demonstration is made anew.
     on_rendered : callable, optional
         Called with the number of images written to the bag so far.
     on_progress, on_written : callable, optional
@@ -98,10 +122,7 @@ def run_demo(
     RecordingError
         When the folder holds something else of these names, or cannot be written.
     """
-    is_own = (out / ROBOT_NAME).is_file()
-    check_unused(out, force=is_own)
-    if not is_own:
-        check_new(out / BAG_NAME)
+    check_place(out)
     write_demo_bags(out, progress=on_rendered)
     source = open_recording(out / BAG_NAME)
     return run_recording(source, out, force=True, on_progress=on_progress, on_written=on_written)

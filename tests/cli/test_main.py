@@ -85,7 +85,9 @@ def test_what_is_there_is_refused_before_a_recording_is_opened(
 ) -> None:
     (here / "taken").mkdir()
     (here / "taken" / "summary.json").write_text("mine")
-    assert "error: taken" in refused(command(*arguments))
+    answer = command(*arguments)
+    assert "error: taken" in refused(answer)
+    assert answer.out == ""
     assert (here / "taken" / "summary.json").read_text() == "mine"
     assert [path.name for path in here.rglob("*")] == ["taken", "summary.json"]
 

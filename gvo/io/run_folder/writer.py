@@ -87,7 +87,9 @@ def free_path(path: Path) -> Path:
     return next(each for each in chain([path], numbered) if not os.path.lexists(each))
 
 
-def check_unused(folder: Path, *, force: bool = False) -> None:
+def check_unused(
+    folder: Path, *, force: bool = False, otherwise: str = ", or --force to replace it"
+) -> None:
     """Refuse a folder that cannot be written, or holds an earlier result; nothing is made.
 
     Parameters
@@ -95,6 +97,8 @@ def check_unused(folder: Path, *, force: bool = False) -> None:
     folder : Path
     force : bool
         Let them be replaced.
+    otherwise : str
+        What else to do than give another folder.
 
     Raises
     ------
@@ -105,8 +109,8 @@ def check_unused(folder: Path, *, force: bool = False) -> None:
     there = [name for name in _RESULTS if os.path.lexists(folder / name)]
     if there and not force:
         raise OutputError(
-            f"{folder}: holds an earlier result ({there[0]}); give another folder by --out, or "
-            "--force to replace it"
+            f"{folder}: holds an earlier result ({there[0]}); give another folder by --out"
+            f"{otherwise}"
         )
 
 
