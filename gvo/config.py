@@ -445,7 +445,15 @@ def load_configuration(path: Path | None = None, settings: Sequence[str] = ()) -
                 "window.n_links=3"
             )
         values.setdefault(section, {})[name] = _parse_value(setting, text)
-    return validate_configuration(values)
+    try:
+        return validate_configuration(values)
+    except ConfigurationError as error:
+        if path is None:
+            raise
+        if settings:
+            load_configuration(path)  # which names the file where the fault is in it
+            raise
+        raise ConfigurationError(f"{path}: {error}") from error
 
 
 def _parse_value(setting: str, text: str) -> object:

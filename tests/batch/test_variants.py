@@ -132,7 +132,7 @@ def test_a_grid_that_has_no_end_is_refused_before_it_is_made() -> None:
 
 def test_a_file_that_is_no_configuration_is_named(tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_text("window: {sise: 3}\n")
-    with pytest.raises(ConfigurationError, match=r"window\.sise"):
+    with pytest.raises(ConfigurationError, match=r"a\.yaml: unknown key window\.sise"):
         make_variants([tmp_path / "a.yaml"])
     with pytest.raises(ConfigurationError, match=r"none\.yaml: No such file"):
         make_variants([tmp_path / "none.yaml"])
