@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import yaml
 
-from gvo._text import MAX_CHARACTERS, YamlError, load_yaml, read_text, shortened
+from gvo._text import MAX_CHARACTERS, YamlError, access_fault, load_yaml, read_text, shortened
 from gvo.errors import CalibrationError, named_faults
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
@@ -109,6 +109,19 @@ def read_cameras(paths: CalibrationPaths, *, sensor: Sensor, is_rectified: bool)
         return _stereo_set(cameras, origin, is_rectified=is_rectified)
     depth_scale = contents[0].depth_scale if contents else None
     return _rgbd_set(cameras, origin, depth_scale, is_rectified=is_rectified)
+
+
+def check_there(*paths: Path) -> None:
+    """Refuse a recording without the files of its calibration.
+
+    Raises
+    ------
+    CalibrationError
+        With the way out.
+    """
+    for path in paths:
+        if fault := access_fault(path):
+            raise CalibrationError(f"{path}: {fault}; add it or give --calibration FILE")
 
 
 def paths_of(calibration: CalibrationPaths) -> tuple[Path, ...]:

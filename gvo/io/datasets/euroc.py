@@ -12,6 +12,7 @@ from gvo.io.calibration.camera_info import stereo_baseline
 from gvo.io.calibration.files import (
     CalibrationPaths,
     CameraSet,
+    check_there,
     paths_of,
     pose_of_rectified,
     read_calibration_file,
@@ -51,6 +52,7 @@ class EurocSource(FolderSource):
         images = {name: _list_images(self._root / name) for name in ("cam0", "cam1")}
         sensors = [self._root / name / "sensor.yaml" for name in images]
         files = paths_of(calibration)
+        check_there(*(() if files else sensors))
         cameras = read_cameras(files or sensors, sensor="stereo", is_rectified=False)
         rectification = "from T_BS and distortion of cam0 and cam1"
         if files:

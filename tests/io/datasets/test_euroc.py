@@ -83,6 +83,14 @@ def test_a_malformed_sensor_is_refused(
         EurocSource(folder)
 
 
+def test_a_missing_sensor_says_the_way_out(tmp_path: Path, tiny: Any) -> None:
+    folder = _write(tmp_path / "m", tiny)
+    (folder / "mav0/cam1/sensor.yaml").unlink()
+    said = r"cam1/sensor\.yaml: does not exist; add it or give --calibration FILE"
+    with pytest.raises(CalibrationError, match=said):
+        EurocSource(folder)
+
+
 def test_a_date_that_is_none_is_refused_in_the_sensor_too(tmp_path: Path, tiny: Any) -> None:
     folder = _write(tmp_path / "m", tiny)
     with (folder / "mav0/cam1/sensor.yaml").open("a") as file:

@@ -116,7 +116,7 @@ def _with(name: str, text: str) -> Any:
     ("spoil", "kind", "text"),
     [
         (_without("times.txt"), RecordingError, r"times\.txt: cannot be read: No such file"),
-        (_without("calib.txt"), RecordingError, r"calib\.txt: cannot be read: No such file"),
+        (_without("calib.txt"), CalibrationError, r"calib\.txt: does not .*--calibration FILE"),
         (_with("times.txt", "0\nx\n0.2\n"), RecordingError, r"times\.txt, line 2: the stamp 'x'"),
         (_with("times.txt", "0\n0.1\n"), RecordingError, r"000002\.png: .* number below 2"),
         (_with("image_0/left.png", ""), RecordingError, r"left\.png: expected an image number"),
