@@ -305,6 +305,10 @@ def ended_by_a_signal(stop: Callable[[], None]) -> Iterator[None]:
         raise SystemExit(_EXIT_CODES_OF_SIGNALS[received[0]] if received else 130) from None
 
 
+class _UndrawnError(KeyboardInterrupt):
+    """Interrupts what has written all, and only draws."""
+
+
 @contextmanager
 def interruptible() -> Iterator[Callable[[object], None]]:
     """Yield a function that ends the work once a signal has come; call it between frames.
@@ -313,18 +317,18 @@ def interruptible() -> Iterator[Callable[[object], None]]:
     one after a call with `_WRITTEN`.
     """
     received: list[int] = []
-    is_written = False
+    kind = KeyboardInterrupt
 
     def receive(number: int, frame: object) -> None:
         received.append(number)
-        if is_written or len(received) > 1:
-            raise KeyboardInterrupt
+        if kind is _UndrawnError or len(received) > 1:
+            raise kind
 
     def check(state: object) -> None:
-        nonlocal is_written
+        nonlocal kind
+        kind = _UndrawnError if state is _WRITTEN else KeyboardInterrupt
         if received:
-            raise KeyboardInterrupt
-        is_written = state is _WRITTEN
+            raise kind
 
     try:
         with _handling(receive):
@@ -334,11 +338,12 @@ def interruptible() -> Iterator[Callable[[object], None]]:
 
 
 @contextmanager
-def told_what_stands(words: str) -> Iterator[None]:
+def told_what_stands(words: str, undrawn: str | None = None) -> Iterator[None]:
     """Say, if the work is interrupted, what of it stands, and how to go on."""
     try:
         yield
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
+        words = undrawn or words if isinstance(error, _UndrawnError) else words
         typer.echo(f"gvo: interrupted; {visible(words)}", err=True)
         raise
 
@@ -347,7 +352,11 @@ def told_where_it_stands(
     out: Path | str, *, and_then: str = "; --force begins anew"
 ) -> AbstractContextManager[None]:
     """Say, if the work is interrupted, where its poses are, and how to go on."""
-    return told_what_stands(f"the poses so far are in {out}{and_then}")
+    undrawn = (
+        f"all is computed and written to {out}, only not drawn{and_then}, and gvo compare --report "
+        "draws its poses"
+    )
+    return told_what_stands(f"the poses so far are in {out}{and_then}", undrawn)
 
 
 class Work(NamedTuple):

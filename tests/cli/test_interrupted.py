@@ -20,6 +20,10 @@ from gvo.viz.report import run as report
 from tests.conftest import Command, line_of_poses
 
 ANEW = "the same command begins anew"
+UNDRAWN = (
+    "all is computed and written to {out}, only not drawn; --force begins anew, and gvo compare "
+    "--report draws its poses"
+)
 POSES_STAND = "the poses so far are in {out}; --force begins anew"
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
 
@@ -73,6 +77,28 @@ def test_a_signal_while_a_recording_is_read_ends_in_one_line(
     if "poses" in stands:
         n_poses = {len(gvo.read_trajectory(out / f"{name}.txt")) for name in ("raw", "smoothed")}
         assert len(n_poses) == 1
+    if words[0] == "run":
+        assert "This run has not ended" in (out / "report.html").read_text()
+
+
+def test_a_run_interrupted_at_its_first_frame_is_drawn(
+    command: Command, interrupt: Interrupt, drive_bag: Path, tmp_path: Path
+) -> None:
+    interrupt(KltFrontend, "extract", 1)
+    assert command("run", drive_bag, "--out", tmp_path).code == 143
+    assert "This run has not ended" in (tmp_path / "report.html").read_text()
+
+
+def test_a_second_signal_ends_the_drawing_of_an_interrupted_run(
+    command: Command, interrupt: Interrupt, drive_bag: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    interrupt(BagMessage, "decode", 12)
+    interrupt(report, "status_plot", 1)
+    answer = command("run", drive_bag, "--out", out)
+    said = f"gvo: interrupted; {POSES_STAND.format(out=out)}\n"
+    assert (answer.code, answer.err) == (143, said)
+    assert not (out / "report.html").exists()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -81,7 +107,7 @@ def test_a_signal_while_the_report_is_drawn_leaves_the_whole_run(
 ) -> None:
     interrupt(report, "status_plot", 1, number)
     answer = command("run", drive_bag, "--out", tmp_path, "--duration", "0.3")
-    said = f"gvo: interrupted; {POSES_STAND.format(out=tmp_path)}\n"
+    said = f"gvo: interrupted; {UNDRAWN.format(out=tmp_path)}\n"
     assert (answer.code, answer.err) == (CODES[number], said)
     assert not (tmp_path / "report.html").exists()
     assert json.loads((tmp_path / "summary.json").read_text())["is_complete"]
@@ -106,7 +132,7 @@ def test_a_signal_while_a_picture_is_drawn_ends_at_once(
     interrupt(module, draw, 1)
     answer = command(*(word.format(bag=drive_bag, poses=poses) for word in words), "--out", out)
     assert answer.code == 143
-    assert answer.err == f"gvo: interrupted; {POSES_STAND.format(out=out)}\n"
+    assert answer.err == f"gvo: interrupted; {UNDRAWN.format(out=out)}\n"
     assert (out / "summary.json").exists()
     assert not list(out.glob("*.png"))
 
