@@ -41,6 +41,22 @@ _LEGEND_CHARACTERS = 135  # of a row
 _MAX_POINTS = 4000
 
 
+def check_suffix(path: Path, *suffixes: str) -> None:
+    """Refuse a file that cannot be written, by its name; a plot's where no suffixes are given.
+
+    Raises
+    ------
+    ConfigurationError
+        With what is expected.
+    """
+    expected = suffixes or tuple(METADATA)
+    if path.suffix.lower() not in expected:
+        raise ConfigurationError(
+            f"{path}: expected a name ending in {', '.join(expected)}, got "
+            f"{path.suffix or 'no ending'}"
+        )
+
+
 def plot_trajectories(
     path: str | Path,
     reference: Trajectory | None,
@@ -73,11 +89,7 @@ def plot_trajectories(
         When there is no estimate, or one without poses.
     """
     path = Path(path)
-    if path.suffix.lower() not in METADATA:
-        raise ConfigurationError(
-            f"{path}: the plot's file name ends in {path.suffix!r}, "
-            f"expected one of {', '.join(METADATA)}"
-        )
+    check_suffix(path)
     if not estimates or any(len(estimate) == 0 for estimate in estimates.values()):
         raise ValueError("expected at least one estimate, and poses in each")
     if reference is None:

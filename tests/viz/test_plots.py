@@ -139,7 +139,7 @@ def test_one_pose_and_many_estimates_are_drawn(tmp_path: Path) -> None:
 
 def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
     for name in ("plot.bmp", "plot"):
-        with pytest.raises(ConfigurationError, match=r"expected one of \.png, \.pdf, \.svg"):
+        with pytest.raises(ConfigurationError, match=r"ending in \.png, \.pdf, \.svg"):
             plot_trajectories(tmp_path / name, None, {"raw": curve(0)})
     (tmp_path / "file").write_text("")
     with pytest.raises(TrajectoryError, match="cannot be written"):

@@ -9,10 +9,10 @@ from typing import Any
 
 from gvo._text import html_text
 from gvo.errors import ConfigurationError, write_faults
+from gvo.viz.plots import check_suffix
 from gvo.viz.report.paths import Line, World, scene_json
 from gvo.viz.report.sheets import Plot
 
-_SUFFIXES = (".html", ".htm")
 _DASHES = {"-": "", "--": "6 4", "-.": "6 3 1 3", ":": "2 3"}
 
 
@@ -32,10 +32,7 @@ def write_page(path: Path, title: str, body: Iterable[str]) -> None:
     ConfigurationError
         When the suffix is not .html or .htm, or the file cannot be written.
     """
-    if path.suffix.lower() not in _SUFFIXES:
-        raise ConfigurationError(
-            f"{path}: expected a name ending in .html, got {path.suffix or 'no ending'}"
-        )
+    check_suffix(path, ".html", ".htm")
     page = "\n".join(
         [
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',

@@ -292,7 +292,7 @@ def test_what_cannot_be_written_is_refused(folder: Path, tmp_path: Path) -> None
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigurationError, match="cannot be written"):
         write_run_report(tmp_path / "file" / "page.html", record)
-    with pytest.raises(ConfigurationError, match=r"ending in \.html, got \.txt"):
+    with pytest.raises(ConfigurationError, match=r"ending in \.html, \.htm, got \.txt"):
         write_run_report(tmp_path / "page.txt", record)
     with pytest.raises(ValueError, match="at least one"):
         write_comparison_report(tmp_path / "page.html", straight(3), {}, [], align="se3")
