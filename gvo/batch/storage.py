@@ -170,5 +170,5 @@ def _naming(location: str | Path, kind: type[GvoError] = RecordingError) -> Iter
         raise
     except Exception as error:
         # Each file system raises errors of its own, of packages not known here.
-        words = str(error) or type(error).__name__
+        words = getattr(error, "strerror", None) or str(error) or type(error).__name__
         raise kind(f"{location}: {words}") from error

@@ -145,6 +145,17 @@ def test_a_url_is_told_by_its_protocol() -> None:
     assert not any(is_url(one) for one in ("/a/b", "a::b", "C:/a", "s3:/a", Path("a//b")))
 
 
+def test_what_may_not_be_read_is_told_in_words(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def forbid(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied", "inside")
+
+    monkeypatch.setattr("gvo.batch.storage.LocalFileSystem.ls", forbid)
+    with pytest.raises(RecordingError, match=f"^{folder}: Permission denied$"):
+        Place.of(folder).entries()
+
+
 def test_whatever_fails_is_an_error_that_names_the_url(folder: Path) -> None:
     for fail in (
         lambda: fetch("broken://x/a", folder),

@@ -77,7 +77,8 @@ def write_bag(
                 writer.write(bag, progress)
             bag.result.rename(path)
     except (OSError, WriterError1, WriterError2) as error:
-        raise RecordingError(f"{path}: cannot be written: {error}") from error
+        detail = getattr(error, "strerror", None) or error
+        raise RecordingError(f"{path}: cannot be written: {detail}") from error
     return common.Conversion(
         path=path,
         n_images=sum(writer.n_images),

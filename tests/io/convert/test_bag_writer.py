@@ -212,6 +212,18 @@ def test_nothing_is_left_behind_where_writing_fails(tmp_path: Path, name: str) -
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_folder_that_may_not_be_written_is_told_in_words(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def forbid(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied", f"{tmp_path}/.convert-x")
+
+    monkeypatch.setattr("tempfile.TemporaryDirectory", forbid)
+    path = tmp_path / "a.bag"
+    with pytest.raises(RecordingError, match=f"^{path}: cannot be written: Permission denied$"):
+        write_bag(_stereo(), path)
+
+
 def test_other_suffixes_and_missing_folders_are_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"\.bag, \.mcap or \.db3.* got \.zip"):
         write_bag(_stereo(), tmp_path / "a.zip")
