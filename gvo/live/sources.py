@@ -15,6 +15,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, BinaryIO
 
@@ -71,7 +72,7 @@ class StandardInput:
         depth_scale: float | None = None,
     ) -> None:
         config = config or Config()
-        self.info, self._stream = info, stream
+        self.info, self._stream = replace(info, name=_WHERE), stream
         self._scale = config.depth.scale or depth_scale or MILLIMETRES
         self._grey_range = GreyRange(black=config.images.black, white=config.images.white)
 
@@ -187,7 +188,7 @@ class Device:
                 "a camera read by OpenCV has no depth: name one device that shows left and right "
                 f"side by side, or two, not {len(names)} of a {info.sensor} camera"
             )
-        self.info = info
+        self.info = replace(info, name=" + ".join(names))
         self._captures = [_opened(name) for name in names]
 
     def images(self) -> Iterator[StampedImage]:

@@ -234,6 +234,15 @@ def test_what_is_no_image_ends_in_one_line(
     )
 
 
+def test_a_stream_without_an_image_is_named(
+    calibration: list[Path], tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO()))
+    said = refused(command("live", *live("-", calibration=calibration, out=tmp_path / "out")))
+    assert said == "gvo: error: standard input: no usable frame: it holds no image\n"
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_stream_that_breaks_off_keeps_what_was_tracked(drive_bag: Path, tmp_path: Path) -> None:
     source = gvo.open_recording(drive_bag)
     pipe = StandardInput(io.BytesIO(sent(source)[:-1000]), source.info)
