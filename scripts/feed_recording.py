@@ -5,6 +5,7 @@ Example: python scripts/feed_recording.py drive.mcap | gvo live - --calibration 
 
 import argparse
 import json
+import os
 import sys
 import time
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 import gvo
+from gvo.io.recording import Source
 
 _ENCODINGS = {
     ("uint8", 2): "mono8",
@@ -29,12 +31,20 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=1.0, help="of the recorded one; 0: no pause")
     arguments = parser.parse_args()
     source = gvo.open_recording(arguments.recording)
+    try:
+        feed(source, arguments.rate)
+    except (KeyboardInterrupt, BrokenPipeError):  # who reads has ended
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def feed(source: Source, rate: float) -> None:
+    """Write all images, as fast as they were recorded, times the rate; 0 without a pause."""
     names = ("left", "right") if source.info.sensor == "stereo" else ("color", "depth")
     first_ns, started_s = None, time.monotonic()
     for image in source.images():
         first_ns = image.stamp_ns if first_ns is None else first_ns
-        if arguments.rate > 0:
-            due_s = started_s + 1e-9 * (image.stamp_ns - first_ns) / arguments.rate
+        if rate > 0:
+            due_s = started_s + 1e-9 * (image.stamp_ns - first_ns) / rate
             time.sleep(max(due_s - time.monotonic(), 0.0))
         send(names[image.stream], image.stamp_ns, image.load())
 

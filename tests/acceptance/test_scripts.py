@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 import subprocess
 import sys
 from dataclasses import replace
@@ -290,3 +291,7 @@ def test_a_recording_is_fed_to_a_live_run(drive_bag: Path, tmp_path: Path) -> No
         answer = python(*live, stdin=sending.stdout)
     assert answer.returncode == 0, answer.stderr
     assert "20 frames, all tracked" in answer.stdout
+    # Who reads may end first.
+    cut = f"{shlex.join(feeder)} | head -c 1000 > /dev/null; exit ${{PIPESTATUS[0]}}"
+    ended = subprocess.run(["bash", "-c", cut], env=ENVIRONMENT, stderr=subprocess.PIPE, check=True)
+    assert ended.stderr == b""
