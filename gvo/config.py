@@ -445,15 +445,7 @@ def load_configuration(path: Path | None = None, settings: Sequence[str] = ()) -
                 "window.n_links=3"
             )
         values.setdefault(section, {})[name] = _parse_value(setting, text)
-    try:
-        return validate_configuration(values)
-    except ConfigurationError as error:
-        if path is None:
-            raise
-        if settings:
-            load_configuration(path)  # which names the file where the fault is in it
-            raise
-        raise ConfigurationError(f"{path}: {error}") from error
+    return validate_configuration(values)
 
 
 def _parse_value(setting: str, text: str) -> object:
@@ -483,6 +475,10 @@ def _read_yaml(path: Path) -> dict[str, dict[str, object]]:
             raise ConfigurationError(
                 f"{path}: {cut(str(section), MAX_SHOWN)} must hold keys, see `gvo config --all`"
             )
+    try:
+        validate_configuration(content)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{path}: {error}") from error
     return content
 
 

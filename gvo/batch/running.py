@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import tempfile
 import time
@@ -120,30 +119,19 @@ def check_place(out: str | Path, tasks: Sequence[Task], options: BatchOptions) -
     """
     if options.force:
         return
-    if Place.of(f"{out}/{MARK}").exists():
-        _check_rows(out, tasks)
-        return
-    if options.plots is not None:
+    is_new = not Place.of(f"{out}/{MARK}").exists()
+    if is_new and options.plots is not None:
         check_new(options.plots, otherwise="--force to replace its plots")
-    if not is_url(out):
-        for folder in ("", *(task.folder for task in tasks)):
-            check_unused(Path(out, folder))
-
-
-def _check_rows(out: str | Path, tasks: Sequence[Task]) -> None:
-    """Refuse a batch that would take runs out of the table that is there."""
-    table = Place.of(f"{out}/{CSV}")
-    if not table.exists():
-        return
-    with suppress(ValueError, KeyError):  # another's table, or damaged
-        rows = pd.read_csv(io.BytesIO(table.read()), dtype=str, keep_default_na=False)
+    for folder in ("", *(task.folder for task in tasks)) if is_new and not is_url(out) else ():
+        check_unused(Path(out, folder))
+    with suppress(OSError, ValueError, KeyError):  # no table, or a damaged one
+        rows = pd.read_csv(f"{out}/{CSV}", dtype=str, keep_default_na=False)
         there = rows["folder"][rows["status"] != "failed"]
         gone = there[~there.isin(to_frame([task.row("failed") for task in tasks])["folder"])]
         if len(gone):
             raise OutputError(
-                f"{out}: holds another batch, whose runs would leave its table: {len(gone)}, the "
-                f"first {gone.iloc[0]}; run them too, give another folder by --out, or --force to "
-                "replace the table"
+                f"{out}: holds another batch, of which {gone.iloc[0]} would leave the table; give "
+                "another folder by --out, its recordings too, or --force to replace the table"
             )
 
 

@@ -78,11 +78,6 @@ class Place:
         with _naming(self.location):
             return bool(self.files.isdir(self.path))
 
-    def read(self) -> bytes:
-        """Return what the file holds."""
-        with _naming(self.location):
-            return bytes(self.files.cat_file(self.path))
-
     def entries(self) -> list[Place]:
         """List a folder, sorted."""
         with _naming(self.location):
@@ -132,7 +127,7 @@ def fetch_file(url: str, target: Path) -> None:
     place = Place.of(url)
     if place.exists():
         with _naming(url):
-            target.write_bytes(place.read())
+            target.write_bytes(place.files.cat_file(place.path))
 
 
 def store(folder: Path, url: str) -> None:

@@ -325,9 +325,8 @@ def compare(
     for path in (plot, report_file, plots):
         if path is not None and not force:
             check_new(path, otherwise="--force to replace it")
-    for path, *suffixes in ((plot,), (report_file, ".html", ".htm")):
-        if path is not None:
-            check_suffix(path, *suffixes)
+    check_suffix(plot)
+    check_suffix(report_file, (".html", ".htm"))
     truth, trajectories, notes = read_compared(reference, estimates)
     warn(notes)
     lengths = None if segments is None else _parse_lengths(segments)

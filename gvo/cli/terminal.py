@@ -352,10 +352,7 @@ def told_where_it_stands(
     out: Path | str, *, and_then: str = "; --force begins anew"
 ) -> AbstractContextManager[None]:
     """Say, if the work is interrupted, where its poses are, and how to go on."""
-    undrawn = (
-        f"all is computed and written to {out}, only not drawn{and_then}, and gvo compare --report "
-        "draws its poses"
-    )
+    undrawn = f"all is computed and in {out}, not drawn{and_then}, gvo compare --report draws it"
     return told_what_stands(f"the poses so far are in {out}{and_then}", undrawn)
 
 

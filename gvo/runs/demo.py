@@ -90,11 +90,10 @@ def check_place(out: Path) -> None:
         With what to do.
     """
     with TemporaryDirectory() as fresh:
-        robot = Path(fresh) / ROBOT_NAME
+        robot, there = Path(fresh) / ROBOT_NAME, out / ROBOT_NAME
         write_robot_bag(_drive().ground_truth(), robot)
-        there = out / ROBOT_NAME
         is_own = there.is_file() and filecmp.cmp(robot, there, shallow=False)
-    check_unused(out, force=is_own, otherwise="")
+    check_unused(out, force=is_own, can_force=False)
     for name in () if is_own else (BAG_NAME, ROBOT_NAME):
         check_new(out / name)
 

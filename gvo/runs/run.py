@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -143,7 +143,7 @@ def run_recording(
         stack.enter_context(written_alone(Path(out), force=force))
         others, notes = outputs.open(loop, files)
         folder = files.enter_context(RunFolder(Path(out)))
-        stack.enter_context(_drawn_if_interrupted(Path(out), outputs))
+        stack.push(partial(_draw_if_interrupted, Path(out), outputs))
         with RunningSummary(loop, folder, identity, on_progress) as summary:
             first = on_start(loop, partial(_save, loop, folder, summary)) if on_start else ()
             loop.run([*first, folder, *others], summary)
@@ -300,16 +300,11 @@ def drawn(result: RunResult, folder: Path, *, plots: Path | None = None) -> RunR
     return replace(result, report=page if page.exists() else None)
 
 
-@contextmanager
-def _drawn_if_interrupted(folder: Path, outputs: RunOutputs) -> Iterator[None]:
+def _draw_if_interrupted(folder: Path, outputs: RunOutputs, kind: object, *_: object) -> None:
     """Draw what was written of a run that is interrupted; a second interrupt ends that, too."""
-    try:
-        yield
-    except KeyboardInterrupt:
+    if kind is KeyboardInterrupt and outputs.report:
         with suppress(GvoError, OSError):
-            if outputs.report:
-                _draw(folder, plots=outputs.plots)
-        raise
+            _draw(folder, plots=outputs.plots)
 
 
 def _draw(folder: Path, *, plots: Path | None) -> None:

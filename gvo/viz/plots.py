@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,16 +41,15 @@ _LEGEND_CHARACTERS = 135  # of a row
 _MAX_POINTS = 4000
 
 
-def check_suffix(path: Path, *suffixes: str) -> None:
-    """Refuse a file that cannot be written, by its name; a plot's where no suffixes are given.
+def check_suffix(path: Path | None, expected: Collection[str] = METADATA) -> None:
+    """Refuse the name of a file, if any, that has another suffix; by default that of a plot.
 
     Raises
     ------
     ConfigurationError
         With what is expected.
     """
-    expected = suffixes or tuple(METADATA)
-    if path.suffix.lower() not in expected:
+    if path is not None and path.suffix.lower() not in expected:
         raise ConfigurationError(
             f"{path}: expected a name ending in {', '.join(expected)}, got "
             f"{path.suffix or 'no ending'}"

@@ -21,8 +21,7 @@ from tests.conftest import Command, line_of_poses
 
 ANEW = "the same command begins anew"
 UNDRAWN = (
-    "all is computed and written to {out}, only not drawn; --force begins anew, and gvo compare "
-    "--report draws its poses"
+    "all is computed and in {out}, not drawn; --force begins anew, gvo compare --report draws it"
 )
 POSES_STAND = "the poses so far are in {out}; --force begins anew"
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}

@@ -111,24 +111,19 @@ def read_cameras(paths: CalibrationPaths, *, sensor: Sensor, is_rectified: bool)
     return _rgbd_set(cameras, origin, depth_scale, is_rectified=is_rectified)
 
 
-def check_there(*paths: Path) -> None:
-    """Refuse a recording without the files of its calibration.
+def paths_of(calibration: CalibrationPaths, *own: Path) -> tuple[Path, ...]:
+    """Return the paths that were given, else those of the recording itself, which must be there.
 
     Raises
     ------
     CalibrationError
         With the way out.
     """
-    for path in paths:
+    given = (calibration,) if isinstance(calibration, Path) else tuple(calibration or ())
+    for path in () if given else own:
         if fault := access_fault(path):
             raise CalibrationError(f"{path}: {fault}; add it or give --calibration FILE")
-
-
-def paths_of(calibration: CalibrationPaths) -> tuple[Path, ...]:
-    """Return the paths that were given; none for None."""
-    if calibration is None:
-        return ()
-    return (calibration,) if isinstance(calibration, Path) else tuple(calibration)
+    return given or own
 
 
 def pose_of_rectified(T_body_raw: FloatArray, camera: Calibration) -> FloatArray:

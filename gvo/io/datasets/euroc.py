@@ -12,7 +12,6 @@ from gvo.io.calibration.camera_info import stereo_baseline
 from gvo.io.calibration.files import (
     CalibrationPaths,
     CameraSet,
-    check_there,
     paths_of,
     pose_of_rectified,
     read_calibration_file,
@@ -51,11 +50,10 @@ class EurocSource(FolderSource):
         self._root = folder / "mav0" if (folder / "mav0").is_dir() else folder
         images = {name: _list_images(self._root / name) for name in ("cam0", "cam1")}
         sensors = [self._root / name / "sensor.yaml" for name in images]
-        files = paths_of(calibration)
-        check_there(*(() if files else sensors))
-        cameras = read_cameras(files or sensors, sensor="stereo", is_rectified=False)
+        files = paths_of(calibration, *sensors)
+        cameras = read_cameras(files, sensor="stereo", is_rectified=False)
         rectification = "from T_BS and distortion of cam0 and cam1"
-        if files:
+        if calibration:
             key = "R and P" if cameras.baseline_from == "P" else cameras.baseline_from
             rectification = f"{key} of {' + '.join(file.name for file in files)}"
         self._T_body_cam = _pose_on_body(cameras, sensors[0])

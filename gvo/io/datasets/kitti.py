@@ -13,13 +13,7 @@ from gvo.errors import CalibrationError, RecordingError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
 from gvo.io.calibration.camera_info import check_camera, rectified_calibration, stereo_baseline
-from gvo.io.calibration.files import (
-    CalibrationPaths,
-    CameraSet,
-    check_there,
-    paths_of,
-    read_cameras,
-)
+from gvo.io.calibration.files import CalibrationPaths, CameraSet, paths_of, read_cameras
 from gvo.io.datasets.files import FolderSource, StampedPath, loader, read_rows, read_stamped_rows
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
@@ -59,12 +53,10 @@ class KittiSource(FolderSource):
         self._stamps_ns = [stamp_ns for stamp_ns, _ in times]
         names = _find_pair(folder)
         images = {name: self._list_images(name) for name in names}
-        files = paths_of(calibration)
-        if files:
+        files = paths_of(calibration, folder / "calib.txt")
+        if calibration:
             cameras = read_cameras(files, sensor="stereo", is_rectified=True)
         else:
-            files = (folder / "calib.txt",)
-            check_there(*files)
             size = _image_size([path for _, path in images[names[0]]], config)
             cameras = _read_cameras(files[0], names, size)
         self._t_cam0_cam = _camera_offset(cameras.calibrations[0])

@@ -87,9 +87,7 @@ def free_path(path: Path) -> Path:
     return next(each for each in chain([path], numbered) if not os.path.lexists(each))
 
 
-def check_unused(
-    folder: Path, *, force: bool = False, otherwise: str = ", or --force to replace it"
-) -> None:
+def check_unused(folder: Path, *, force: bool = False, can_force: bool = True) -> None:
     """Refuse a folder that cannot be written, or holds an earlier result; nothing is made.
 
     Parameters
@@ -97,8 +95,8 @@ def check_unused(
     folder : Path
     force : bool
         Let them be replaced.
-    otherwise : str
-        What else to do than give another folder.
+    can_force : bool
+        Name `--force` as a way out.
 
     Raises
     ------
@@ -110,7 +108,7 @@ def check_unused(
     if there and not force:
         raise OutputError(
             f"{folder}: holds an earlier result ({there[0]}); give another folder by --out"
-            f"{otherwise}"
+            f"{', or --force to replace it' if can_force else ''}"
         )
 
 

@@ -32,7 +32,7 @@ def write_page(path: Path, title: str, body: Iterable[str]) -> None:
     ConfigurationError
         When the suffix is not .html or .htm, or the file cannot be written.
     """
-    check_suffix(path, ".html", ".htm")
+    check_suffix(path, (".html", ".htm"))
     page = "\n".join(
         [
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
