@@ -34,6 +34,7 @@ HOLLOW: dict[str, Any] = {"mfc": "white", "mec": "black", "zorder": 4.0}
 """The marks of start and turn."""
 
 _FLAT = 0.05  # extent of a flat axis, relative to another
+_DOWN = 0.8  # cosine, on the mean, of the camera's y axis and that of a world whose y points down
 _GAP = 10.0  # a line is broken at steps longer than so many medians
 _SIZE_INCHES = (11.0, 5.5)
 _ROUND_TRIP_INCHES = (11.0, 6.2)
@@ -362,14 +363,16 @@ def broken(seconds: FloatArray, points: FloatArray) -> FloatArray:
 def is_of_camera(reference: Trajectory) -> bool:
     """Tell whether the world has camera axes: x right, y down, z forward.
 
-    True if the first pose is the identity and the path is not flat along z, as that of a robot
-    with z up is. Positions without rotations have no first pose.
+    True if the first pose is the identity, or y of the camera points along y of the world mostly,
+    and the path is not flat along z, as that of a robot with z up is. Positions without rotations
+    do not tell.
     """
     if len(reference) == 0 or not reference.has_rotations:
         return False
     extents = np.ptp(reference.positions, axis=0)
-    begins = np.allclose(reference.T_world_frame[0], np.eye(4), atol=1e-3)
-    return bool(begins and extents[2] >= _FLAT * extents[1])
+    T = reference.T_world_frame
+    is_down = np.allclose(T[0], np.eye(4), atol=1e-3) or T[:, 1, 1].mean() > _DOWN
+    return bool(is_down and extents[2] >= _FLAT * extents[1])
 
 
 def ground_plane(reference: Trajectory) -> tuple[int, int]:

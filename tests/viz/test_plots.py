@@ -24,15 +24,26 @@ BLACK, RAW, CAUSAL, SMOOTHED, FREE = (
 )
 
 
+# A camera that looks along x of a world with z up.
+UPRIGHT = np.array(
+    [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0, 0, 0, 1]]
+)
+
+
 def curve(
-    seed: int, *, extents: tuple[float, float, float] = (3.0, 0.2, 5.0), start: float = 0.0
+    seed: int,
+    *,
+    extents: tuple[float, float, float] = (3.0, 0.2, 5.0),
+    start: float = 0.0,
+    is_upright: bool = False,
 ) -> Trajectory:
     angle = np.linspace(0.0, 6.0, 60)
     twists = np.zeros((60, 6))
     twists[:, 3:] = np.column_stack([np.sin(angle), angle / 6, 1 - np.cos(angle)]) * extents
     twists[1:, 3:] += np.random.default_rng(seed).normal(size=(59, 3)) * 0.05
     twists[:, 3:] += start
-    return Trajectory(stamps_ns=np.arange(60) * 100_000_000, T_world_frame=se3.exp(twists))
+    T = se3.exp(twists) @ (UPRIGHT if is_upright else np.eye(4))
+    return Trajectory(stamps_ns=np.arange(60) * 100_000_000, T_world_frame=T)
 
 
 def n_pixels(path: Path, rgb: tuple[int, int, int]) -> int:
@@ -69,7 +80,9 @@ def test_equal_input_gives_equal_files(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("extents", "start", "axes"),
     [
-        ((3.0, 9.0, 5.0), 0.0, "xz"),  # the world of a camera, whatever it did
+        # the world of a camera, whatever it did
+        ((3.0, 9.0, 5.0), 0.0, "xz"),
+        ((3.0, 9.0, 5.0), 1.0, "xz"),
         # any other has z up, whatever was done in it
         ((3.0, 5.0, 0.2), 1.0, "xy"),
         ((0.2, 5.0, 3.0), 1.0, "xy"),
@@ -79,7 +92,7 @@ def test_equal_input_gives_equal_files(tmp_path: Path) -> None:
 def test_the_view_is_from_above_as_that_of_the_report(
     tmp_path: Path, extents: tuple[float, float, float], start: float, axes: str
 ) -> None:
-    reference = curve(0, extents=extents, start=start)
+    reference = curve(0, extents=extents, start=start, is_upright=axes == "xy")
     text = svg_text(tmp_path, reference, {"raw": curve(1, extents=extents)})
     assert "".join(axis for axis in "xyz" if f"<!-- {axis} [m] -->" in text) == axes
     world = World.of(reference)
@@ -92,7 +105,8 @@ def test_the_view_is_from_above_as_that_of_the_report(
 def test_a_robot_without_truth_is_seen_from_above_too(tmp_path: Path) -> None:
     """The panels beside have the axes as labels, the view has two of them once more."""
     for extents, start, axes in (((3.0, 9.0, 5.0), 0.0, "xz"), ((3.0, 5.0, 0.2), 1.0, "xy")):
-        text = svg_text(tmp_path, None, {"raw": curve(0, extents=extents, start=start)})
+        path = curve(0, extents=extents, start=start, is_upright=axes == "xy")
+        text = svg_text(tmp_path, None, {"raw": path})
         assert "".join(axis for axis in "xyz" if text.count(f"<!-- {axis} [m] -->") == 2) == axes
 
 

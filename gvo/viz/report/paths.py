@@ -54,7 +54,7 @@ class World:
     def words(self) -> str:
         """The axes, as a sentence."""
         if self.is_up_negative:
-            return "The world is that of the first camera: x right, y down, z forward."
+            return "The axes of the world are those of a camera: x right, y down, z forward."
         return "The z axis of the world is assumed to point up."
 
 
