@@ -22,15 +22,7 @@ DepthArray: TypeAlias = NDArray[np.float32]
 FrameId: TypeAlias = Hashable
 
 
-def _freeze(value: object, *names: str) -> None:
-    """Replace arrays of a frozen value by copies that nobody can write to."""
-    for name in names:
-        array = np.array(getattr(value, name))
-        array.setflags(write=False)
-        object.__setattr__(value, name, array)
-
-
-def _freeze_shaped(value: object, **shapes: tuple[int, ...]) -> None:
+def _freeze(value: object, **shapes: tuple[int, ...]) -> None:
     """Replace arrays by read-only copies in float64 of the given shapes."""
     for name, shape in shapes.items():
         try:
@@ -265,9 +257,9 @@ class MotionPrior:
 
     def __post_init__(self) -> None:
         """Copy the arrays."""
-        _freeze_shaped(self, T_predicted=(4, 4))
+        _freeze(self, T_predicted=(4, 4))
         if self.T_recent is not None:
-            _freeze_shaped(self, T_recent=(4, 4))
+            _freeze(self, T_recent=(4, 4))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -381,7 +373,7 @@ class Edge:
             hash(self.reference_id)
         except TypeError:
             raise ValueError(f"reference_id must be hashable: {self.reference_id!r}") from None
-        _freeze_shaped(self, T_reference_frame=(4, 4), covariance=(6, 6))
+        _freeze(self, T_reference_frame=(4, 4), covariance=(6, 6))
         _check_kernel(self.kernel)
 
 
@@ -405,7 +397,7 @@ class PosePrior:
 
     def __post_init__(self) -> None:
         """Copy the arrays."""
-        _freeze_shaped(self, T_world_frame=(4, 4), covariance=(6, 6))
+        _freeze(self, T_world_frame=(4, 4), covariance=(6, 6))
         _check_kernel(self.kernel)
 
 
@@ -429,7 +421,7 @@ class PositionPrior:
 
     def __post_init__(self) -> None:
         """Copy the arrays."""
-        _freeze_shaped(self, position_world=(3,), covariance=(3, 3))
+        _freeze(self, position_world=(3,), covariance=(3, 3))
         _check_kernel(self.kernel)
 
 
@@ -530,7 +522,7 @@ class Estimate:
 
     def __post_init__(self) -> None:
         """Copy the arrays."""
-        _freeze(self, "T_world_frame", "covariance")
+        _freeze(self, T_world_frame=(4, 4), covariance=(6, 6))
 
     def _repr_html_(self) -> str:
         """Return a table for notebooks."""

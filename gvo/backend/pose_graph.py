@@ -12,7 +12,6 @@ import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-from types import MappingProxyType
 from typing import Any, TypeAlias
 
 import gtsam
@@ -180,7 +179,7 @@ class PoseGraph:
     def iterate(
         self,
         before: Mapping[int, gtsam.Pose3],
-        starts: Mapping[int, gtsam.Pose3] = MappingProxyType({}),
+        starts: Mapping[int, gtsam.Pose3],
         *,
         alive: Collection[int] = (),
         leaving: Sequence[int] = (),

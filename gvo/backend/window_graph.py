@@ -324,7 +324,7 @@ class WindowGraph:
         with self._isam.restored_on_error():
             before = self._isam.poses3(factor.keys())
             self._isam.update(factors, gtsam.Values())
-            self._isam.iterate(before)
+            self._isam.iterate(before, {})
             estimate = self._estimate(frame_id)
             _check_result(estimate.T_world_frame)
             self._check_others()

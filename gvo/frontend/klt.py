@@ -516,11 +516,8 @@ class KltFrontend:
         """Measure the disparities of tracks near predicted ones; without slopes, search wider."""
         config, images = self._config.stereo, (frame.left, frame.right)
         offset_px, row_offset_px = self._offsets_px()
-        measure = (
-            partial(measure_disparities, reach_px=config.search_radius_px)
-            if slopes is None
-            else partial(follow_disparities, n_steps=_N_TRACK_STEPS, slopes=slopes)
-        )
+        follow = partial(follow_disparities, n_steps=_N_TRACK_STEPS, slopes=slopes)
+        measure = measure_disparities if slopes is None else follow
         disparities, is_valid = measure(
             images, pixels, predicted, config, row_offset_px=row_offset_px
         )

@@ -26,7 +26,7 @@ import weakref
 from array import array
 from bisect import bisect, bisect_left
 from collections import Counter
-from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
@@ -42,6 +42,7 @@ from gvo.backend.motion_model import MAX_EXTRAPOLATION_S, predict_step
 from gvo.config import WindowConfig
 from gvo.errors import SmoothingError
 from gvo.geometry import se3
+from gvo.io.edges.events import inverted
 from gvo.io.run_folder.line_file import append_whole
 from gvo.odometry.keyframes import chi2
 from gvo.types import Edge, Estimate, FloatArray, FrameId, Loop, Optimum, PosePrior, Status
@@ -531,7 +532,7 @@ class RunGraph:
             if stamp_ns == frame_ns:
                 _fuse(edges, int(edge.reference_id), edge)  # type: ignore[call-overload]
             else:
-                _fuse(edges, frame_ns, _inverse(frame_ns, edge))
+                _fuse(edges, frame_ns, inverted(edge, frame_ns))
         del self._touching[stamp_ns]
         if loop is not None:
             _fuse(edges, int(loop.reference_id), loop)  # type: ignore[call-overload]
@@ -545,12 +546,12 @@ class RunGraph:
         self._merged.append(stamp_ns, hub_ns, stamp_ns, 0, *place)
         # What ties it to the other one counts once, shared out among the edges that go on there.
         hub = replace(hub, covariance=max(len(edges), 1) * hub.covariance)
-        moved = {ns: _join(hub, _inverse(stamp_ns, edge)) for ns, edge in edges.items()}
+        moved = {ns: _join(hub, inverted(edge, stamp_ns)) for ns, edge in edges.items()}
         neighbours = set().union(*(self._touching[ns] for ns in moved))
         between = [number for number in self._touching[hub_ns] if number in neighbours]
         for frame_ns, edge in self._pop_edges(between):
             if frame_ns == hub_ns:
-                _fuse(moved, int(edge.reference_id), _inverse(frame_ns, edge))  # type: ignore[call-overload]
+                _fuse(moved, int(edge.reference_id), inverted(edge, frame_ns))  # type: ignore[call-overload]
             else:
                 _fuse(moved, frame_ns, edge)
         for each in moved.items():
@@ -566,20 +567,11 @@ class RunGraph:
             graph._open, _ = graph._condense()
         return graph
 
-    def optimize(
-        self, *, covariances: bool = True, on_step: Callable[[str], None] = lambda _: None
-    ) -> Optimum:
+    def optimize(self) -> Optimum:
         """Return the poses that fit all measurements best, loops that contradict the rest apart.
 
         Nothing is changed by it. Where loops contradict the covariances of odometry, those of the
         poses are as much larger.
-
-        Parameters
-        ----------
-        covariances : bool
-            Else they are the identity.
-        on_step : callable
-            Called with the state in words.
 
         Raises
         ------
@@ -589,14 +581,12 @@ class RunGraph:
         if not self._keyframes:
             raise SmoothingError("the graph of the run is empty: no frame has come (loops.enabled)")
         graph = self._copied()
-        poses, _, reasons, error_before, optimizer, firsts = graph._solve(on_step)
+        poses, _, reasons, error_before, optimizer, firsts = graph._solve()
         loops = tuple(
             replace(each, reason=each.reason or reasons.get(_ends(each), ""))
             for each in graph.loops
         )
-        found = np.broadcast_to(np.eye(6), (len(graph), 6, 6))
-        if covariances:
-            found = graph._variance_factor(loops) * optimizer.covariances()
+        found = graph._variance_factor(loops) * optimizer.covariances()
         by_keyframe = dict(zip(graph._keyframes, found, strict=True))
         for stamp_ns, first_ns in firsts.items():
             Ad = se3.adjoint(se3.invert(poses[stamp_ns]) @ poses[first_ns])
@@ -615,19 +605,17 @@ class RunGraph:
             n_iterations=optimizer.n_iterations,
         )
 
-    def _solve(self, on_step: Callable[[str], None] = lambda _: None) -> _Solution:
-        loops, reasons, refused = self._judged(on_step)
+    def _solve(self) -> _Solution:
+        loops, reasons, refused = self._judged()
         graph = self._whole(loops, refused=refused)
         firsts = self._bridge(graph)
-        optimizer = BatchOptimizer(graph, on_step=on_step)
+        optimizer = BatchOptimizer(graph)
         error_before = optimizer.starts["odometry"]
         optimizer.run()
         poses = dict(zip(self._keyframes, optimizer.poses(), strict=True))
         return _Solution(poses, loops, reasons, error_before, optimizer, firsts)
 
-    def _judged(
-        self, on_step: Callable[[str], None]
-    ) -> tuple[list[Loop], dict[tuple[object, int], str], _Pairs]:
+    def _judged(self) -> tuple[list[Loop], dict[tuple[object, int], str], _Pairs]:
         """Return the loops of keyframes that count, and why those between others do not.
 
         And the pairs of keyframes whose loops, or edges between parts, are refused.
@@ -640,7 +628,7 @@ class RunGraph:
             possible = [loop for loop in loops if _ends(loop) not in refused]
             drift = _DRIFT * np.sqrt(len(self._edges))
             graph = self._whole(possible, drift=drift, refused=refused)
-            optimizer = BatchOptimizer(graph, "gnc", on_step=on_step)
+            optimizer = BatchOptimizer(graph, "gnc")
             optimizer.run(only_refuse=True)
             keyframes = list(self._keyframes)
             refused |= {(keyframes[a], keyframes[b]) for a, b, _ in optimizer.refused}
@@ -923,13 +911,6 @@ def _join(first: Edge, second: Edge) -> Edge:
 
 def _ends(loop: Loop) -> tuple[object, int]:
     return loop.reference_ns, loop.stamp_ns
-
-
-def _inverse(frame_id: FrameId, edge: Edge) -> Edge:
-    """Return the pose of the reference in the frame."""
-    Ad = se3.adjoint(edge.T_reference_frame)
-    covariance = Ad @ edge.covariance @ Ad.T
-    return _edge(frame_id, se3.invert(edge.T_reference_frame), 0.5 * (covariance + covariance.T))
 
 
 def _fuse(edges: dict[int, Edge], key: int, edge: Edge) -> None:

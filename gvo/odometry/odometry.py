@@ -390,11 +390,8 @@ class Odometry:
         """Let covariances be what edges state once a pose rests on a guess."""
         if step.failure is not None:
             self._starts, self._is_broken = {}, True
-        offsets = self._frontend.rig_offsets
-        if offsets is not None and not self._is_broken:
-            self._window.variance_factor = offsets.window_factor.value
-        else:
-            self._window.variance_factor = 1.0
+        offsets = None if self._is_broken else self._frontend.rig_offsets
+        self._window.variance_factor = 1.0 if offsets is None else offsets.window_factor.value
 
     def _note_misclosure(self, link: Edge, step: RawStep) -> None:
         """Tell the front-end how well a link agrees with the raw chain since its keyframe."""

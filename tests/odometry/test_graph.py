@@ -72,7 +72,7 @@ def whole(drive: Drive) -> BatchOptimizer:
 
 def test_exact_edges_give_the_true_poses() -> None:
     drive = looped(None)
-    optimum = drive.graph.optimize(covariances=False)
+    optimum = drive.graph.optimize()
     assert not any(loop.reason for loop in optimum.loops)
     np.testing.assert_allclose(poses(optimum), drive.truth, rtol=0.0, atol=1e-9)
 
@@ -105,8 +105,8 @@ def test_the_world_and_the_order_of_loops_are_free(twist: list[float], order: li
         T_world_frame = T @ drive.truth[j]
         moved.add_frame(estimate_at(j * PERIOD_NS, T_world_frame), edges, is_keyframe=j % 5 == 0)
     moved.loops = [drive.graph.loops[k] for k in order]
-    expected = T @ poses(drive.graph.optimize(covariances=False))
-    np.testing.assert_allclose(poses(moved.optimize(covariances=False)), expected, atol=1e-6)
+    expected = T @ poses(drive.graph.optimize())
+    np.testing.assert_allclose(poses(moved.optimize()), expected, atol=1e-6)
 
 
 def test_frames_between_keyframes_lie_between_both_ends() -> None:
@@ -121,7 +121,7 @@ def test_frames_between_keyframes_lie_between_both_ends() -> None:
         edges = [Edge(reference_id=j * PERIOD_NS, T_reference_frame=step, covariance=covariance)]
     whole_way = se3.make_transform(np.eye(3), np.array([20.0, 0.0, 0.0]))
     graph.loops = [Drive(np.array([np.eye(4)] * 21)).loop(0, 20, T=whole_way)]
-    x = poses(graph.optimize(covariances=False))[:, 0, 3]
+    x = poses(graph.optimize())[:, 0, 3]
     np.testing.assert_allclose(np.diff(x), 1.0, atol=0.01)
 
 
@@ -153,7 +153,7 @@ def test_an_optimum_on_the_way_changes_nothing_that_comes_later() -> None:
         asked.step(j)
         other.step(j)
         if j % 7 == 3:
-            assert len(asked.graph.optimize(covariances=False).estimates) == j + 1
+            assert len(asked.graph.optimize().estimates) == j + 1
     expected, found = other.graph.optimize(), asked.graph.optimize()
     np.testing.assert_array_equal(poses(found), poses(expected))
     np.testing.assert_array_equal(poses(asked.graph.optimize()), poses(expected))
@@ -164,7 +164,7 @@ def test_ten_false_loops_among_ten_true_ones_are_refused(is_consistent: bool) ->
     rng = np.random.default_rng(5)
     drive = looped(5, n_loops=10, n_laps=1.6)
     true = list(drive.graph.loops)
-    expected = position_error(poses(drive.graph.optimize(covariances=False)), drive.truth)
+    expected = position_error(poses(drive.graph.optimize()), drive.truth)
     twin = se3.exp(np.array([0.0, 0.01, 0.0, 0.1, 0.0, 0.3]))
     false = [
         drive.loop(20 + 5 * k, 70 + 5 * k, T=twin)  # as on a street that looks alike
@@ -173,7 +173,7 @@ def test_ten_false_loops_among_ten_true_ones_are_refused(is_consistent: bool) ->
         for k in range(10)
     ]
     drive.graph.loops = [*false, *true]
-    optimum = drive.graph.optimize(covariances=False)
+    optimum = drive.graph.optimize()
     assert [bool(loop.reason) for loop in optimum.loops] == [True] * 10 + [False] * 10
     assert position_error(poses(optimum), drive.truth) < 1.05 * expected
 
@@ -181,7 +181,7 @@ def test_ten_false_loops_among_ten_true_ones_are_refused(is_consistent: bool) ->
 def test_loops_count_where_odometry_drifts_more_than_it_says() -> None:
     drive = looped(1, bias=(0.01, 0.001))
     loops, drive.graph.loops = drive.graph.loops, ()
-    before = position_error(poses(drive.graph.optimize(covariances=False)), drive.truth)
+    before = position_error(poses(drive.graph.optimize()), drive.truth)
     drive.graph.loops = loops
     optimum = drive.graph.optimize()
     assert not any(loop.reason for loop in optimum.loops)
@@ -305,13 +305,13 @@ def test_a_frame_that_hangs_on_a_keyframe_takes_no_memory() -> None:
     finally:
         tracemalloc.stop()
     assert (sizes[1] - sizes[0]) / 1_000 < 60
-    assert len(drive.graph.optimize(covariances=False).estimates) == len(drive.truth)
+    assert len(drive.graph.optimize().estimates) == len(drive.truth)
 
 
 def test_frames_without_a_keyframe_do_not_wait_without_end() -> None:
     drive = stand(450, every=1_000)
     assert len(drive.graph) == 3
-    assert len(drive.graph.optimize(covariances=False).estimates) == 450
+    assert len(drive.graph.optimize().estimates) == 450
 
 
 @pytest.mark.parametrize("is_full", [False, True])
@@ -387,7 +387,7 @@ def test_a_map_of_many_laps_is_that_of_a_few(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(graph_module, "_MAX_LINKED", 0)
     truth = block(40)
     drive, detector = go_round(truth, 200)
-    optimum = drive.graph.optimize(covariances=False)
+    optimum = drive.graph.optimize()
     # Four at each of 40 places, the latest, and those since the map was last optimized.
     assert len(drive.graph) < 260
     assert len(optimum.edges) < 600

@@ -94,9 +94,9 @@ def test_false_loops_after_a_loss_are_refused_where_more_true_ones_follow() -> N
     true = [drive.loop(5 * k, N_LAP + 5 * k) for k in range(4)]
     drive.graph.loops = false
     # with nothing against them they count
-    assert not any(loop.reason for loop in drive.graph.optimize(covariances=False).loops)
+    assert not any(loop.reason for loop in drive.graph.optimize().loops)
     drive.graph.loops = [*false, *true]
-    optimum = drive.graph.optimize(covariances=False)
+    optimum = drive.graph.optimize()
     assert [bool(loop.reason) for loop in optimum.loops] == [True] * 3 + [False] * 4
     assert position_error(poses(optimum)[30:], truth[30:]) < 0.01
 
@@ -105,10 +105,10 @@ def test_a_twin_that_lies_farther_than_one_drives_in_the_dark_is_refused() -> No
     truth = block(1.4, n_per_lap=N_LAP)
     drive = lit_again(truth, dark=range(20, 25))
     drive.graph.loops = [drive.loop(5 * k, 50 + 5 * k, T=TWIN) for k in range(3)]
-    loops = drive.graph.optimize(covariances=False).loops
+    loops = drive.graph.optimize().loops
     assert {loop.reason for loop in loops} == {"farther from odometry than that drifts"}
     drive.graph.loops = [drive.loop(5 * k, N_LAP + 5 * k) for k in range(3)]
-    assert not any(loop.reason for loop in drive.graph.optimize(covariances=False).loops)
+    assert not any(loop.reason for loop in drive.graph.optimize().loops)
 
 
 @pytest.mark.parametrize(("speed_m", "n_dark"), [(2.0, 20), (3.0, 50), (0.02, 20)])
@@ -126,7 +126,7 @@ def test_whatever_moves_may_halt_in_the_dark(speed_m: float, n_dark: int) -> Non
         estimate = estimate_at(j * PERIOD_NS, T_guess, status=Status.LOST if is_dark else Status.OK)
         drive.graph.add_frame(estimate, edges, is_keyframe=j % 5 == 0 and not is_dark)
     drive.graph.loops = [drive.loop(20 - 5 * k, 20 + n_dark + 5 * k) for k in range(1, 3)]
-    assert not any(loop.reason for loop in drive.graph.optimize(covariances=False).loops)
+    assert not any(loop.reason for loop in drive.graph.optimize().loops)
 
 
 @pytest.mark.parametrize("n_twins", [3, 8])
@@ -137,7 +137,7 @@ def test_where_most_loops_are_refused_none_leads_across_a_loss(n_twins: int) -> 
     # As between equal rooms: odometry tells that these are 5 m apart.
     twins = [drive.loop(100 + 5 * k, 150 + 5 * k, T=np.eye(4)) for k in range(n_twins)]
     drive.graph.loops = [*across, *twins]
-    reasons = [loop.reason for loop in drive.graph.optimize(covariances=False).loops]
+    reasons = [loop.reason for loop in drive.graph.optimize().loops]
     assert all(reasons[4:])
     doubt = "across a loss, where most other loops are refused" if n_twins > 4 else ""
     assert reasons[:4] == [doubt] * 4
@@ -163,7 +163,7 @@ def test_a_wrong_edge_across_the_dark_is_refused_as_a_loop_is() -> None:
         estimate = estimate_at(j * PERIOD_NS, T, status=status)
         drive.graph.add_frame(estimate, edges, is_keyframe=j % 5 == 0)
     drive.graph.loops = [drive.loop(5 * k, N_LAP + 5 * k) for k in range(4)]
-    assert position_error(poses(drive.graph.optimize(covariances=False)), truth) < 0.01
+    assert position_error(poses(drive.graph.optimize()), truth) < 0.01
 
 
 def walk(n: int = 120, step_m: float = 0.1) -> FloatArray:
@@ -174,7 +174,7 @@ def walk(n: int = 120, step_m: float = 0.1) -> FloatArray:
 def test_loops_between_equal_rooms_are_refused_however_many_agree() -> None:
     drive = Drive(walk()).run()
     drive.graph.loops = [drive.loop(5 * k, 50 + 5 * k, T=np.eye(4)) for k in range(12)]
-    optimum = drive.graph.optimize(covariances=False)
+    optimum = drive.graph.optimize()
     assert {loop.reason for loop in optimum.loops} == {"farther from odometry than that drifts"}
     assert position_error(poses(optimum), drive.truth) < 0.01
 
@@ -185,14 +185,14 @@ def test_the_way_between_two_places_counts_not_what_came_before(n_more: int) -> 
     drive = Drive(truth).run()
     last = len(truth) - 1 - (len(truth) - 1) % 5
     drive.graph.loops = [drive.loop(last - 50, last, T=np.eye(4))] * 2
-    assert all(loop.reason for loop in drive.graph.optimize(covariances=False).loops)
+    assert all(loop.reason for loop in drive.graph.optimize().loops)
 
 
 @pytest.mark.parametrize("bias", [(0.01, 0.0), (0.0, 0.0005), (-0.01, -0.0005)])
 def test_true_loops_count_after_one_percent_of_drift(bias: tuple[float, float]) -> None:
     drive = Drive(block(1.3, n_per_lap=N_LAP), np.random.default_rng(1), bias=bias).run()
     drive.graph.loops = [drive.loop(5 * k, N_LAP + 5 * k) for k in range(5)]
-    assert not any(loop.reason for loop in drive.graph.optimize(covariances=False).loops)
+    assert not any(loop.reason for loop in drive.graph.optimize().loops)
 
 
 class CountedPlaces(MadeUpPlaces):

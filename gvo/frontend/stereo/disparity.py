@@ -31,7 +31,6 @@ def measure_disparities(
     predicted: FloatArray,
     config: StereoConfig,
     *,
-    reach_px: int,
     row_offset_px: float = 0.0,
 ) -> tuple[FloatArray, BoolArray]:
     """Measure the disparities of pixels near predicted ones, to a fraction of a pixel.
@@ -49,9 +48,7 @@ def measure_disparities(
     predicted : ndarray of float64, shape (n,)
         Pixels.
     config : StereoConfig
-        Size of the patches.
-    reach_px : int
-        How far to search on either side.
+        Size of the patches, how far to search on either side.
     row_offset_px : float
         Row offset of the right image.
 
@@ -71,7 +68,7 @@ def measure_disparities(
         )
         return strips.disparities(places), is_minimum
 
-    return _measure(images, pixels, predicted, search, config, reach_px, row_offset_px)
+    return _measure(images, pixels, predicted, search, config, row_offset_px)
 
 
 def follow_disparities(
@@ -90,18 +87,14 @@ def follow_disparities(
     is False where they do not converge. With the slopes of the disparities, shape (n, 2), patches
     of the right image are sampled as those of slanted surfaces.
     """
-    reach_px = config.search_radius_px
     if config.subpixel == "none":
-        row = row_offset_px
-        return measure_disparities(
-            images, pixels, predicted, config, reach_px=reach_px, row_offset_px=row
-        )
+        return measure_disparities(images, pixels, predicted, config, row_offset_px=row_offset_px)
 
     def follow(wide: NDArray[np.float32], strips: Strips) -> tuple[FloatArray, BoolArray]:
         places, is_at_rest = strips.follow(Patches.of(wide), n_steps=n_steps)
         return strips.disparities(places), is_at_rest
 
-    return _measure(images, pixels, predicted, follow, config, reach_px, row_offset_px, slopes)
+    return _measure(images, pixels, predicted, follow, config, row_offset_px, slopes)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -243,7 +236,6 @@ def _measure(
     predicted: FloatArray,
     search: Callable[[NDArray[np.float32], Strips], tuple[FloatArray, BoolArray]],
     config: StereoConfig,
-    reach_px: int,
     row_offset_px: float,
     slopes: FloatArray | None = None,
 ) -> tuple[FloatArray, BoolArray]:
@@ -262,7 +254,7 @@ def _measure(
             rows,
             starts,
             radius_px=radius,
-            reach_px=reach_px,
+            reach_px=config.search_radius_px,
             slopes=None if slopes is None else slopes[chosen],
         )
         disparities[chosen], is_valid[chosen] = search(wide, strips)

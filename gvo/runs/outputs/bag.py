@@ -86,7 +86,6 @@ SUFFIXES: Final = (".mcap", ".bag")
 N_SHOWN_POSES: Final = 500
 """Most poses of a path while the run goes."""
 
-_SECOND_NS: Final = 10**9
 _POINTS, _PICTURE = "/gvo/points", "/gvo/matches/compressed"
 TOPICS: Final = {
     "/tf": TF_TYPE,
@@ -263,7 +262,7 @@ class RunMessages:
 
     def _write_paths_of_second(self, stamp_ns: int) -> None:
         """Write the paths where a new second of the recording has begun."""
-        n_seconds = (stamp_ns - (self._first_ns or 0)) // _SECOND_NS
+        n_seconds = (stamp_ns - (self._first_ns or 0)) // 10**9
         if n_seconds > self._n_seconds:
             self._n_seconds = n_seconds
             self.write_paths(N_SHOWN_POSES)

@@ -244,7 +244,6 @@ class RerunStream:
 N_SHOWN_POSES: Final = 500
 """Most poses of a path while the run goes."""
 
-_SECOND_NS: Final = 10**9
 _TRACKED: Final = "world/causal/frame"
 _CAMERA: Final = f"{_TRACKED}/camera"
 
@@ -414,7 +413,7 @@ class RerunWriter:
 
     def _add_lines(self, stamp_ns: int) -> None:
         """Log where it was: the paths where a new second of the recording has begun."""
-        n_seconds = (stamp_ns - (self._first_ns or 0)) // _SECOND_NS
+        n_seconds = (stamp_ns - (self._first_ns or 0)) // 10**9
         if n_seconds > self._n_seconds:
             self._n_seconds = n_seconds
             self.add_paths(N_SHOWN_POSES)

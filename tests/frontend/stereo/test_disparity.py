@@ -20,9 +20,7 @@ def pair(disparity: FloatArray | float, **right: float) -> tuple[ImageArray, Ima
 
 def test_flat_images_hold_no_disparities() -> None:
     flat = np.full(SHAPE, 90, dtype=np.uint8)
-    _, is_valid = measure_disparities(
-        (flat, flat), grid(), np.full(len(grid()), 5.0), CONFIG, reach_px=3
-    )
+    _, is_valid = measure_disparities((flat, flat), grid(), np.full(len(grid()), 5.0), CONFIG)
     assert not is_valid.any()
 
 
@@ -33,7 +31,7 @@ def test_the_fine_search_is_right_to_hundredths_wherever_it_starts(
 ) -> None:
     pixels = grid() + fraction
     predicted = np.full(len(pixels), disparity + error)
-    found, is_valid = measure_disparities(pair(disparity), pixels, predicted, CONFIG, reach_px=3)
+    found, is_valid = measure_disparities(pair(disparity), pixels, predicted, CONFIG)
     assert is_valid.mean() > 0.9
     errors = found[is_valid] - disparity
     # OpenCV 4 rounds where it interpolates to a 32nd of a pixel.
@@ -43,9 +41,7 @@ def test_the_fine_search_is_right_to_hundredths_wherever_it_starts(
 
 def test_unequal_exposure_does_not_shift_disparities() -> None:
     predicted = np.full(len(grid()), 7.0)
-    found, is_valid = measure_disparities(
-        pair(7.3, gain=0.9), grid(), predicted, CONFIG, reach_px=3
-    )
+    found, is_valid = measure_disparities(pair(7.3, gain=0.9), grid(), predicted, CONFIG)
     assert abs(np.median(found[is_valid]) - 7.3) < 0.02
 
 
@@ -55,18 +51,17 @@ def test_the_disparity_is_that_of_the_very_pixel(fraction: float) -> None:
     rows = np.arange(SHAPE[0]).astype(float)
     pixels = grid() + np.array([0.0, fraction])
     expected = 2.0 + 0.2 * pixels[:, 1]
-    found, is_valid = measure_disparities(
-        pair(2.0 + 0.2 * rows), pixels, np.rint(expected), CONFIG, reach_px=3
-    )
+    found, is_valid = measure_disparities(pair(2.0 + 0.2 * rows), pixels, np.rint(expected), CONFIG)
     assert is_valid.mean() > 0.8
     assert abs(np.median((found - expected)[is_valid])) < 0.04  # half a row is 0.1
 
 
 def test_a_best_step_at_the_end_of_the_search_is_no_answer() -> None:
     predicted = np.full(len(grid()), 2.0)
-    _, is_valid = measure_disparities(pair(12.0), grid(), predicted, CONFIG, reach_px=2)
+    near = CONFIG.model_copy(update={"search_radius_px": 2})
+    _, is_valid = measure_disparities(pair(12.0), grid(), predicted, near)
     assert is_valid.mean() < 0.5
-    _, is_valid = measure_disparities(pair(12.0), grid(), predicted + 9.0, CONFIG, reach_px=2)
+    _, is_valid = measure_disparities(pair(12.0), grid(), predicted + 9.0, near)
     assert is_valid.mean() > 0.9
 
 
@@ -75,7 +70,7 @@ def test_a_best_step_at_the_end_of_the_search_is_no_answer() -> None:
 )
 def test_patches_that_leave_an_image_are_not_measured(pixel: tuple[float, float]) -> None:
     pixels, predicted = np.array([pixel, (100.0, 60.0)]), np.full(2, 10.0)
-    found, is_valid = measure_disparities(pair(10.0), pixels, predicted, CONFIG, reach_px=3)
+    found, is_valid = measure_disparities(pair(10.0), pixels, predicted, CONFIG)
     assert is_valid.tolist() == [False, True]
     assert np.isnan(found[0])
     assert found[1] == pytest.approx(10.0, abs=0.05)
@@ -85,12 +80,12 @@ def test_patches_that_leave_an_image_are_not_measured(pixel: tuple[float, float]
 def test_images_smaller_than_a_patch_give_nothing(shape: tuple[int, int]) -> None:
     tiny = np.zeros(shape, dtype=np.uint8)
     pixels = np.array([[1.0, 1.0]])
-    assert not measure_disparities((tiny, tiny), pixels, np.ones(1), CONFIG, reach_px=3)[1].any()
+    assert not measure_disparities((tiny, tiny), pixels, np.ones(1), CONFIG)[1].any()
 
 
 def test_no_pixels_give_no_disparities() -> None:
     nothing = np.zeros((0, 2))
-    assert measure_disparities(pair(3.0), nothing, np.zeros(0), CONFIG, reach_px=3)[0].shape == (0,)
+    assert measure_disparities(pair(3.0), nothing, np.zeros(0), CONFIG)[0].shape == (0,)
 
 
 @settings(max_examples=15)
