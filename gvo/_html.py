@@ -35,14 +35,13 @@ def estimate_html(stamp_ns: int, pose: _FloatArray, covariance: _FloatArray, *, 
     str
         HTML.
     """
-    rows = [("status", status), ("stamp", f"{format_stamp(stamp_ns)} s")]
-    if pose.shape != (4, 4) or covariance.shape != (6, 6):
-        return card("Estimate", rows)
     R, positions = pose[:3, :3], pose[:3, 3]
     with np.errstate(invalid="ignore", over="ignore"):
         position_sigmas = np.sqrt(np.diag(R @ covariance[3:, 3:] @ R.T))
         rotation_sigmas = np.degrees(np.sqrt(np.diag(covariance)[:3]))
-    rows += [
+    rows = [
+        ("status", status),
+        ("stamp", f"{format_stamp(stamp_ns)} s"),
         ("position x, y, z [m]", vector(positions, position_sigmas)),
         ("rotation vector [deg]", vector(_rotation_vector_deg(R), rotation_sigmas)),
     ]

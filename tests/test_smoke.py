@@ -12,8 +12,8 @@ def test_the_demo_its_comparison_and_its_smoothing(
     command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "gvo-demo"
-    for n_frames in (2, 12):  # into its own folder again
-        monkeypatch.setattr("gvo.runs.demo.N_FRAMES", n_frames)
+    monkeypatch.setattr("gvo.runs.demo.N_FRAMES", 12)
+    for _ in range(2):  # into its own folder again
         assert command("demo", "--out", out).code == 0
     assert {"drive.mcap", "robot.mcap", "summary.json", "report.html", "trajectories.png"} <= {
         path.name for path in out.iterdir()

@@ -232,6 +232,8 @@ def _finished(smoother: Smoother) -> Iterator[None]:
         with suppress(OutputError):
             smoother.folder.write_summary(summary)
         raise
+    if smoother.n_poses == 0:
+        smoother.folder.discard()
 
 
 def _events(source: EdgeSource, notes: SmoothingNotes) -> Iterator[Event]:
@@ -267,7 +269,6 @@ def _conclude(
     """Write summary and picture of a finished run, and compare with the truth."""
     folder, notes = smoother.folder, smoother.notes
     if smoother.n_poses == 0:
-        folder.discard()
         raise _nothing_to_smooth(notes)
     estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
     summary = {**_summary(smoother), "configuration": smoother.config.model_dump()}

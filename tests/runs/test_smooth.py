@@ -267,7 +267,8 @@ def test_what_was_computed_stays_where_the_run_is_interrupted(tmp_path: Path) ->
 
 def test_an_input_without_poses_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="nothing to smooth"):
-        smooth_edges(ListSource([]), tmp_path)
+        smooth_edges(ListSource([]), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_fusing_independent_chains_is_better_than_the_worse(tmp_path: Path) -> None:

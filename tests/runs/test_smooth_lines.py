@@ -109,7 +109,8 @@ def test_the_end_of_the_reader_ends_the_stream(tmp_path: Path) -> None:
 
 def test_a_stream_without_poses_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="standard input: nothing to smooth"):
-        run(["nonsense", ""], tmp_path)
+        run(["nonsense", ""], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 _numbers = st.integers(-3, 3) | st.floats(-5, 5) | st.just(float("nan")) | st.just(1e300)
