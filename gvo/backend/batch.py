@@ -88,7 +88,7 @@ def optimize_batch(
     """
     error, n_iterations = float(factors.error(values)), 0
     before = error
-    for values, error in descend(factors, values):  # noqa: B007, B020 - the last ones count
+    for values, error, _ in descend(factors, values):  # noqa: B007, B020 - the last ones count
         n_iterations += 1
     result = BatchResult(error_before=before, error_after=error, n_iterations=n_iterations)
     return values, result
@@ -96,8 +96,8 @@ def optimize_batch(
 
 def descend(
     factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, *, n_steps: int = _MAX_ITERATIONS
-) -> Iterator[tuple[gtsam.Values, float]]:
-    """Yield ever better values and their errors, by Levenberg-Marquardt, until they converge."""
+) -> Iterator[tuple[gtsam.Values, float, bool]]:
+    """Yield ever better values, their error, and whether it converged, by Levenberg-Marquardt."""
     solver = "MULTIFRONTAL_CHOLESKY"
     optimizer = _optimizer(factors, values, solver)
     error = optimizer.error()
@@ -112,8 +112,9 @@ def descend(
             optimizer = _optimizer(factors, values, solver)
             continue
         values, before, error = optimizer.values(), error, optimizer.error()
-        yield values, error
-        if not before - error > _TOLERANCE * before:
+        is_converged = not before - error > _TOLERANCE * before
+        yield values, error, is_converged
+        if is_converged:
             return
 
 
@@ -327,7 +328,7 @@ class LocalGraph:
             values.insert(key, gtsam.Pose3(found[frame_id].T_origin_frame))
         last_key = self._keys.get(last)
         try:
-            for values, _ in descend(self._graph, values, n_steps=_N_LOCAL_STEPS):  # noqa: B007, B020
+            for values, *_ in descend(self._graph, values, n_steps=_N_LOCAL_STEPS):  # noqa: B007, B020
                 pass
             marginals = gtsam.Marginals(self._graph, values)
             poses = as_transforms(values)
@@ -488,12 +489,12 @@ class BatchOptimizer:
 
     def _descend(self, n_steps: int) -> bool:
         """Descend at most so many steps; tell whether the error has converged."""
-        before = self.error
-        for values, error in descend(self._factors, self.values, n_steps=n_steps):
-            self.values, before, self.error = values, self.error, error
+        is_converged = False
+        for step in descend(self._factors, self.values, n_steps=n_steps):
+            self.values, self.error, is_converged = step
             self.n_iterations += 1
             self._on_step(f"iteration {self.n_iterations}: error {self.error:.6g}")
-        return not before - self.error > _TOLERANCE * before
+        return is_converged
 
     def _graduate(self) -> None:
         """Find out which of the doubted edges count, by a cost that becomes ever sharper."""
@@ -574,18 +575,18 @@ def sparse_marginals(graph: gtsam.GaussianFactorGraph) -> Callable[[int], FloatA
     RuntimeError
         If the poses are not determined.
     """
-    keys = sorted(graph.keyVector())
+    ranks = {key: rank for rank, key in enumerate(sorted(graph.keyVector()))}
     rows, columns, values = graph.sparseJacobian_()
     places = np.array([rows, columns], dtype=int) - 1
     # Zeros are left out, so the column of the residuals may seem to be missing.
-    J = csc_array((values, tuple(places)), shape=(places[0].max() + 1, 6 * len(keys) + 1))[:, :-1]
+    J = csc_array((values, tuple(places)), shape=(places[0].max() + 1, 6 * len(ranks) + 1))[:, :-1]
     solved = splu((J.T @ J).tocsc())
     pivots = np.abs(solved.U.diagonal())
     if pivots.min() < _LEAST_PIVOT * pivots.max():
         raise RuntimeError("a pose is not determined")
 
     def marginal(key: int) -> FloatArray:
-        block = 6 * keys.index(key) + np.arange(6)
+        block = 6 * ranks[key] + np.arange(6)
         unit = np.zeros((J.shape[1], 6))
         unit[block] = np.eye(6)
         return np.asarray(solved.solve(unit)[block])

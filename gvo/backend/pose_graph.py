@@ -67,7 +67,6 @@ class PoseGraph:
             # Propagate every change to the oldest pose: by default small ones are ignored, which
             # loses what smoothing gains with edges accurate to a tenth of a millimetre.
             parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
-        self._parameters = parameters
         self._isam = gtsam.ISAM2(parameters)
         self._n_poses = 0
         self._saved: gtsam.ISAM2 | None = None
@@ -258,7 +257,7 @@ class PoseGraph:
                 factors.add(gtsam.LinearContainerFactor(factor.linearize(turned), turned))
             elif factor is not None:
                 factors.add(factor)
-        self._isam, self._n_poses, self._saved = gtsam.ISAM2(self._parameters), 0, None
+        self._isam, self._n_poses, self._saved = gtsam.ISAM2(self._isam.params()), 0, None
         self.update(factors, values, alive=alive, leaving=leaving)
 
     def marginalize(self, keys: Sequence[int]) -> None:

@@ -74,16 +74,14 @@ def ransac_rigid(
             reason=f"{n} matches, {config.min_inliers} are needed (ransac.min_inliers)", n_matches=n
         )
     near = _near(correspondences, config)
-    samples = near[draw_samples(len(near), config.n_hypotheses, rng)]
-    note("ransac.samples", samples=samples, near=near)
-    best = _search(samples, correspondences, camera, config, near=near)
-    if best is None and len(near) < n:  # near points on a line: far ones may not be
-        near = np.arange(n)
-        samples = draw_samples(n, config.n_hypotheses, rng)
-        best = _search(samples, correspondences, camera, config, near=near)
-    if best is None:
-        return Failure(reason=f"{n} points lie on a line", n_matches=n)
-    return _refit(best, correspondences, camera, config, near=near, weights=weights)
+    # Where the near points lie on a line, the far ones may not.
+    for pool in [near] if len(near) == n else [near, np.arange(n)]:
+        samples = pool[draw_samples(len(pool), config.n_hypotheses, rng)]
+        note("ransac.samples", samples=samples, near=pool)
+        best = _search(samples, correspondences, camera, config, near=pool)
+        if best is not None:
+            return _refit(best, correspondences, camera, config, near=pool, weights=weights)
+    return Failure(reason=f"{n} points lie on a line", n_matches=n)
 
 
 def _search(

@@ -504,7 +504,7 @@ def optimize_edges(
             _write_poses(graph, optimizer, folder, file)
     estimates = {"raw": optimizer.trajectory(of=optimizer.raw), "smoothed": smoothed}
     truth = _with_stamps(ground_truth, source, folder)
-    warnings = [*_broken_off(len(graph.frame_ids), notes), *_left_out(graph, optimizer)]
+    warnings = [*_broken_off(len(graph.frame_ids), notes), *_batch_warnings(graph, optimizer)]
     warnings += notes.warnings
     summary = _batch_summary(graph, optimizer, robust, notes)
     return _written(folder, summary, estimates, truth, warnings, not warnings, on_written)
@@ -551,7 +551,7 @@ def _rows(graph: WholeGraph, optimizer: BatchOptimizer) -> Iterator[tuple[object
         yield stamp_ns, frame_id, status, ends[number], n_rejected, reason
 
 
-def _left_out(graph: WholeGraph, optimizer: BatchOptimizer) -> Iterator[str]:
+def _batch_warnings(graph: WholeGraph, optimizer: BatchOptimizer) -> Iterator[str]:
     if graph.rejected:
         yield f"{len(graph.rejected)} edges or priors were refused; the first: {graph.rejected[0]}"
     if not optimizer.is_converged:
