@@ -17,6 +17,7 @@ from collections import deque
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from xmlrpc.client import ServerProxy
 
 sys.path.append("/usr/lib/python3/dist-packages")  # Debian's rospy, beside a virtual environment
 
@@ -115,8 +116,16 @@ class Answers:
 
     @property
     def are_heard(self) -> bool:
-        """Whether the odometry is announced and connected."""
-        return bool(self._subscriber.get_num_connections() > 0)
+        """Whether who answers sends to this node; a listener is connected a moment before."""
+        name, own, master = self._subscriber.resolved_name, rospy.get_name(), rospy.get_master()
+        _, _, (published, _, _) = master.getSystemState()
+        links: list[Any] = []
+        for node in dict(published).get(name, ()):
+            _, _, uri = master.lookupNode(node)
+            with ServerProxy(uri) as peer:
+                info: Any = peer.getBusInfo(own)
+            links += info[2]
+        return any((link[1], link[2], link[4]) == (own, "o", name) for link in links)
 
     def n_of(self, stamps_ns: list[int]) -> int:
         """Return how many of these stamps were answered."""

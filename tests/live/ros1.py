@@ -21,7 +21,7 @@ PACKAGES = ("rospy", "rosmaster", "sensor_msgs", "std_srvs", "dynamic_reconfigur
 INSTALL = "apt-get install " + " ".join(
     f"python3-{package.replace('_', '-')}" for package in (*PACKAGES, "tf2_msgs")
 )
-PATIENCE_S = 60.0
+PATIENCE_S = 90.0  # longer than that of the programs, which then say what they wait for
 
 
 class Program:
@@ -57,8 +57,8 @@ class Program:
             return len(found) >= n
 
         with self._come:
-            is_come = self._come.wait_for(has_come, PATIENCE_S)
-        assert is_come, (text, self.lines, self.errors)
+            while not has_come():  # as long as anything comes
+                assert self._come.wait(PATIENCE_S), (text, self.lines, self.errors)
         return found[n - 1]
 
     def tell(self, line: str) -> None:

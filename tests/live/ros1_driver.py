@@ -144,6 +144,7 @@ def drive(recording: str) -> None:
             until(lambda: answers.are_heard, "nobody announces the odometry")
         elif index != 30:
             answers.wait([pair[0].stamp_ns], 0)
+        tell(f"pair {index}")
     tell("driven")
     sys.stdin.read()
 
