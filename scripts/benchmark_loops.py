@@ -20,6 +20,7 @@ import csv
 import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import benchmark_seeds  # type: ignore[import-not-found]  # beside this one
@@ -152,8 +153,9 @@ def measure(sources: Iterable[Source], settings: Sequence[str], spoiling: Spoili
 
 def judge(source: Source, config: gvo.Config, spoiling: Spoiling) -> list[float]:
     """Return the figures of a line, NaN where there is none."""
+    run = partial(gvo.run_recording, config=config, outputs=gvo.RunOutputs(report=False))
     with tempfile.TemporaryDirectory() as folder:
-        gvo.run_recording(spoiling.darkened(source), Path(folder) / "run", config=config)
+        run(spoiling.darkened(source), Path(folder) / "run")
         record = read_run(Path(folder) / "run")
         truth = source.ground_truth()
         if truth is None:
@@ -171,7 +173,7 @@ def judge(source: Source, config: gvo.Config, spoiling: Spoiling) -> list[float]
             *of_loops(truth, record.folder),
         ]
         if spoiling.dark_s is not None:
-            gvo.run_recording(spoiling.drifting(source), Path(folder) / "unbroken", config=config)
+            run(spoiling.drifting(source), Path(folder) / "unbroken")
             unbroken = read_run(Path(folder) / "unbroken")
             estimate = tracked(record, unbroken.comparable()["global"])
             ate = gvo.evaluate(truth, estimate, name="").ate_m

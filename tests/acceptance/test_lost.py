@@ -60,7 +60,7 @@ def test_windows_that_repeat_connect_nothing_across_the_dark() -> None:
 
 
 def test_equal_rooms_are_not_taken_for_each_other() -> None:
-    rooms = gvo.SyntheticRecording("rooms", "rgbd", n_frames=700, seed=1, scale=0.5)
+    rooms = gvo.SyntheticRecording("rooms", "rgbd", n_frames=450, seed=1, scale=0.5)
     odometry, _ = follow(rooms)
     loops = odometry.optimize().loops
     assert len(loops) > 3

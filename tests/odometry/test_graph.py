@@ -385,7 +385,7 @@ def test_a_graph_that_begins_later_leaves_out_what_was_before() -> None:
 @pytest.mark.acceptance
 def test_a_map_of_many_laps_is_that_of_a_few(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(graph_module, "_MAX_LINKED", 0)
-    truth = block(40)
+    truth = block(20)
     drive, detector = go_round(truth, 200)
     optimum = drive.graph.optimize()
     # Four at each of 40 places, the latest, and those since the map was last optimized.
