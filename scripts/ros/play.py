@@ -122,9 +122,9 @@ class Answers:
         links: list[Any] = []
         for node in dict(published).get(name, ()):
             _, _, uri = master.lookupNode(node)
-            with ServerProxy(uri) as peer:
+            with suppress(OSError), ServerProxy(uri) as peer:  # one that is gone stays listed
                 info: Any = peer.getBusInfo(own)
-            links += info[2]
+                links += info[2]
         return any((link[1], link[2], link[4]) == (own, "o", name) for link in links)
 
     def n_of(self, stamps_ns: list[int]) -> int:
