@@ -116,14 +116,14 @@ class Answers:
 
     @property
     def are_heard(self) -> bool:
-        """Whether who answers sends to this node; a listener is connected a moment before."""
-        name, own, master = self._subscriber.resolved_name, rospy.get_name(), rospy.get_master()
-        _, _, (published, _, _) = master.getSystemState()
+        """Whether who answers sends to this node, which is connected a moment before."""
+        if self._stamps_ns:  # it has sent already
+            return bool(self._subscriber.get_num_connections() > 0)
+        name, own = self._subscriber.resolved_name, rospy.get_name()
         links: list[Any] = []
-        for node in dict(published).get(name, ()):
-            _, _, uri = master.lookupNode(node)
-            with suppress(OSError), ServerProxy(uri) as peer:  # one that is gone stays listed
-                info: Any = peer.getBusInfo(own)
+        for connection in self._subscriber.impl.connections:
+            with suppress(OSError), ServerProxy(connection.endpoint_id) as node:
+                info: Any = node.getBusInfo(own)
                 links += info[2]
         return any((link[1], link[2], link[4]) == (own, "o", name) for link in links)
 

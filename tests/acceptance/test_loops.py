@@ -12,7 +12,7 @@ from gvo.geometry import se3
 from gvo.testing.faults import Black, FaultySource
 from gvo.trajectory.g2o import format_edge
 from tests.acceptance.conftest import SCRIPTS, Script
-from tests.conftest import python
+from tests.conftest import python, run_of
 
 pytestmark = pytest.mark.acceptance
 
@@ -111,9 +111,8 @@ def test_the_table_shows_the_errors_that_the_runs_tell(tmp_path: Path) -> None:
     cells = [cell.strip() for cell in table[2].strip("| ").split("|")]
     room = gvo.SyntheticRecording("handheld", "rgbd", n_frames=40, seed=2, scale=0.5)
     dark = FaultySource(room, Black(first=15, end=24))
-    outputs = gvo.RunOutputs(report=False)
-    gvo.run_recording(dark, tmp_path / "dark", outputs=outputs)
-    gvo.run_recording(room, tmp_path / "unbroken", outputs=outputs)
+    run_of(dark, tmp_path / "dark")
+    run_of(room, tmp_path / "unbroken")
     rows = (tmp_path / "dark/frames.csv").read_text().splitlines()[1:]
     is_lit = [row.split(",")[1] in ("ok", "resumed") for row in rows]
     assert 28 <= sum(is_lit) <= 31

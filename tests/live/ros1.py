@@ -57,8 +57,8 @@ class Program:
             return len(found) >= n
 
         with self._come:
-            while not has_come():  # as long as anything comes
-                assert self._come.wait(PATIENCE_S), (text, self.lines, self.errors)
+            is_come = self._come.wait_for(has_come, PATIENCE_S)
+        assert is_come, (text, self.lines, self.errors)
         return found[n - 1]
 
     def tell(self, line: str) -> None:

@@ -21,9 +21,7 @@ import gvo
 from gvo.io.bag.topics import CAMERA_INFO_TYPE, IMAGE_TYPE
 from gvo.io.convert.bag_messages import Header, write_camera_info, write_image
 from gvo.io.convert.bag_writer import plan_streams
-from scripts.ros.play import Answers, Writer, introduce, until
-
-PATIENCE_S = 60.0
+from scripts.ros.play import PATIENCE_S, Answers, Writer, introduce, until
 
 
 def tell(line: str) -> None:
@@ -145,7 +143,6 @@ def drive(recording: str) -> None:
         elif index != 30:
             answers.wait([pair[0].stamp_ns], 0)
         tell(f"pair {index}")
-    tell("driven")
     sys.stdin.read()
 
 

@@ -20,7 +20,6 @@ from tests.live.ros1 import PATIENCE_S, Program, Ros
 FOLDER = Path(__file__).parent
 PEER, DRIVER = FOLDER / "ros1_peer.py", FOLDER / "ros1_driver.py"
 PLAYER = FOLDER.parents[1] / "scripts" / "ros" / "play.py"
-NO_REPORT = gvo.RunOutputs(report=False)
 STAMP_NS = 1_700_000_000_123_456_789
 CLOCK_NS = 5_000_000_006
 
@@ -179,7 +178,8 @@ def test_a_session_goes_on_whatever_comes(ros: Ros, gvo_data: Path, tmp_path: Pa
     driver = ros.start(DRIVER, recording)
     driver.wait_for("introduced")  # CameraInfo is sent once, and not again
     odometry = live(ros, tmp_path / "out")
-    driver.wait_for("driven")
+    for index in range(40):
+        driver.wait_for(f"pair {index}\n")
     driver.send(signal.SIGKILL)
     odometry.wait_for("no images for")
     player = ros.start(PLAYER, recording, "--ahead", "0")

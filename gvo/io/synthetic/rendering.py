@@ -161,11 +161,9 @@ class View:
             The rectangle.
         rows : ndarray of int64, shape (n_rows,)
         """
-        # Of the image each has one row: `moveaxis` would take longer than the arithmetic.
-        chosen = (
-            np.moveaxis(forms[rows, k], 0, -1) if self.is_rolling else forms[k, ..., np.newaxis]
-        )
-        a, b, c = (chosen[..., axis, :] for axis in range(3))
+        chosen = forms[rows, k] if self.is_rolling else forms[np.newaxis, k]
+        # `moveaxis` would take longer than the arithmetic.
+        a, b, c = (chosen[..., axis].T for axis in range(3))
         return a, b * rows + c
 
 
