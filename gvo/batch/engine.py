@@ -94,11 +94,26 @@ def connected(scheduler: str | None, n_workers: int | None) -> Iterator[Client]:
             yield client
         return
     try:
-        client = Client(scheduler, timeout=_CONNECT_S)
-    except (OSError, ValueError) as error:
+        client = _ClosingClient(scheduler, timeout=_CONNECT_S)
+    except (OSError, ValueError, TypeError) as error:  # TypeError: TLS without a certificate
         raise ClusterError(f"{scheduler}: no scheduler of Dask answers: {error}") from error
     with _silenced_client(), client:
         yield client
+
+
+class _ClosingClient(Client):
+    """A client that is closed where it cannot start.
+
+    Left to the collector of garbage it would wait for a lock there, for ever where the collector
+    runs in a thread that holds it: in the start of another client.
+    """
+
+    def __init__(self, address: str, timeout: str) -> None:
+        try:
+            super().__init__(address, timeout=timeout)  # type: ignore[no-untyped-call]
+        except BaseException:
+            self.close()  # type: ignore[no-untyped-call]
+            raise
 
 
 def _start_workers(n_workers: int | None) -> LocalCluster:

@@ -178,7 +178,9 @@ def test_misuse_is_a_line_before_anything_begins(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense://x", "127.0.0.1:x", ""])
+@pytest.mark.parametrize(
+    "address", ["tcp://127.0.0.1:1", "nonsense://x", "tls://127.0.0.1:1", "127.0.0.1:x", ""]
+)
 def test_no_scheduler_is_a_line(
     bags: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch, address: str
 ) -> None:

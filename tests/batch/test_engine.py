@@ -15,7 +15,7 @@ import pytest
 from distributed import Client
 
 import gvo
-from gvo.batch.engine import BatchProgress, Engine, connected
+from gvo.batch.engine import BatchProgress, ClusterError, Engine, connected
 from gvo.batch.inputs import NamedRecording, make_variants
 from gvo.batch.running import make_tasks
 from gvo.batch.tasks import MARK, BatchRow, Task, TaskOptions
@@ -49,6 +49,24 @@ def known_to_scheduler(client: Client) -> int:
         return sum(str(key).startswith("('gvo-batch") for key in dask_scheduler.tasks)
 
     return int(client.run_on_scheduler(count))
+
+
+@pytest.mark.parametrize("address", ["nonsense://x", "tls://127.0.0.1:1"])
+def test_a_client_that_cannot_start_is_not_left_to_the_collector(
+    monkeypatch: pytest.MonkeyPatch, address: str
+) -> None:
+    """It would wait there, for ever, for a lock that the start of another client may hold."""
+    clients: list[Client] = []
+    start: Any = Client.start
+
+    def watched(client: Client, **options: Any) -> None:
+        clients.append(client)
+        start(client, **options)
+
+    monkeypatch.setattr(Client, "start", watched)
+    with pytest.raises(ClusterError), connected(address, None):
+        pass
+    assert [client.status for client in clients] == ["closed"]
 
 
 @contextmanager
