@@ -313,6 +313,11 @@ class DepthTrust:
         squares = self._squares
         return float(np.median(squares)) / _MEDIAN if len(squares) >= _N_NEEDED else 0.0
 
+    @property
+    def variance_factor(self) -> float:
+        """By how much the covariances of motions are too small, those by colour and by depth."""
+        return max(self.disagreement, 1.0) if self.is_on else 1.0
+
     def is_due(self) -> bool:
         """Tell, once for each frame, whether its depth is to be aligned."""
         if self.mode == "never":
@@ -336,4 +341,4 @@ class DepthTrust:
         """Return the covariance of an edge by depth; None where there is to be none, or not yet."""
         if not self.is_on or len(self._squares) < _N_NEEDED:
             return None
-        return max(self.disagreement, 1.0) * covariance
+        return self.variance_factor * covariance

@@ -18,7 +18,7 @@ from gvo.frontend.depth_icp import DepthAligner
 from gvo.frontend.descriptor import as_stereo
 from gvo.frontend.features import describe_pixels, thin
 from gvo.frontend.registration import check_view, match_anywhere, register_anywhere
-from gvo.frontend.rgbd import check_depths, sample_depth
+from gvo.frontend.rgbd import check_depths, is_seen_again, sample_depth
 from gvo.frontend.stereo.corners import measure_corners
 from gvo.frontend.stereo.disparity import follow_disparities, measure_disparities
 from gvo.frontend.stereo.matching import is_in_depth_range
@@ -317,13 +317,14 @@ class KltFrontend:
             return rough
         prior = MotionPrior(T_predicted=rough.T_reference_current)
         result = self._register_from(prior, reference, observations, "aligned", is_step=False)
-        result = check_view(result, reference.points_cam, self.camera)
+        checked = check_view(result, reference.points_cam, self.camera)
         points, frame = reference.depth_points, observations.frame
         if isinstance(result, Failure) or points is None or not isinstance(frame, RgbdFrame):
-            return result
-        return check_depths(
-            result, points.astype(np.float64), frame.depth, self.camera, self._config.depth
-        )
+            return checked
+        depths = points.astype(np.float64), frame.depth, self.camera, self._config.depth
+        if isinstance(checked, Failure) and is_seen_again(result, *depths):
+            checked = check_view(result, reference.points_cam, self.camera, depths_agree=True)
+        return checked if isinstance(checked, Failure) else check_depths(checked, *depths)
 
     def _register_places(self, reference: KltPlace, current: KltPlace) -> RelativePose | Failure:
         """Register by descriptors, which match corners that moved too far for a track."""

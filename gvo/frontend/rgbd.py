@@ -30,6 +30,11 @@ _GATE = 3.0
 _MIN_POINTS = 100
 # Edges, holes and moving objects contradict right motions too, but never most of the view.
 _MIN_AGREEING = 0.5
+# Share that agrees where a place is seen again, and on average at most after steps to four sides,
+# relative to the median depth. Of pairs of three recordings from the hand 0.8 agree at the true
+# motion, at wrong ones 0.6 at most in nineteen of twenty; after steps aside mostly 0.5 to 0.7.
+_MIN_SAME, _MAX_ASIDE = 0.8, 0.8
+_STEPS_ASIDE = 0.2 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
 
 
 def sample_depth(
@@ -170,6 +175,34 @@ def check_depths(
         n_matches=result.n_matches,
         n_inliers=result.n_inliers,
     )
+
+
+def is_seen_again(
+    result: RelativePose,
+    points: FloatArray,
+    depth: DepthArray,
+    camera: StereoCamera,
+    config: DepthConfig,
+) -> bool:
+    """Tell whether a depth image shows what a reference shows, and shows it nowhere else.
+
+    A wall agrees with itself wherever it is looked at: what agrees as well after steps aside is no
+    evidence.
+
+    Parameters
+    ----------
+    result, points, depth, camera, config
+        See `check_depths`.
+    """
+    if len(points) < _MIN_POINTS:
+        return False
+    shares = []
+    for step in (np.zeros(3), *(np.median(points[:, 2]) * _STEPS_ASIDE)):
+        T = se3.make_transform(np.eye(3), step) @ result.T_reference_current
+        differences = compare_depths(points, depth, T, camera, config)
+        n_agreeing = np.count_nonzero(np.abs(differences) <= _GATE)
+        shares.append(n_agreeing / max(len(differences), _MIN_POINTS))
+    return bool(shares[0] >= _MIN_SAME and np.mean(shares[1:]) <= _MAX_ASIDE)
 
 
 def compare_depths(

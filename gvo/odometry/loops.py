@@ -114,6 +114,8 @@ class LoopDetector:
     ----------
     loops : sequence of Loop
         All that were registered; those without a reason against them are confirmed.
+    variance_factor : float
+        Of the covariances of loops to come, where registrations are less certain than they state.
     """
 
     def __init__(
@@ -136,6 +138,7 @@ class LoopDetector:
         self._n_searches: dict[int, int] = {}
         self._n_paused = 0
         self.loops = _Loops()
+        self.variance_factor = 1.0
 
     def reconfigure(self, frontend: Recognizer, *, keeps_places: bool) -> None:
         """Go on with another front-end; places of another kind are not searched any more."""
@@ -193,8 +196,9 @@ class LoopDetector:
         if world != self._world:
             self._leave_world()
         self._world = world
-        is_search = self._is_search(world)
-        is_place = is_keyframe and not self._shows_latest(T_world_frame)
+        shows_latest = self._shows_latest(T_world_frame)
+        is_search = self._is_search(world, shows_latest=shows_latest)
+        is_place = is_keyframe and not shows_latest
         if not (is_search or is_place):
             return ()
         describe = self._describe_densely if is_search else self._frontend.describe
@@ -227,13 +231,16 @@ class LoopDetector:
         while self._recent:
             self._keep_oldest_recent()
 
-    def _is_search(self, world: int) -> bool:
-        """Tell whether a frame of a world that is not connected searches all others."""
+    def _is_search(self, world: int, *, shows_latest: bool) -> bool:
+        """Tell whether a frame of a world searches all others: until it is connected, and eagerly.
+
+        Once it is connected, a frame that shows what another one showed would only repeat it.
+        """
         if not self._visits:
             self._connected.add(world)
-        if world in self._connected:
+        n_searches = self._n_searches.setdefault(world, 0 if self._visits else _N_EAGER)
+        if world in self._connected and (shows_latest or n_searches >= _N_EAGER):
             return False
-        n_searches = self._n_searches.get(world, 0)
         self._n_paused += 1
         if self._n_paused <= min(n_searches - _N_EAGER, _MAX_PAUSE):
             return False
@@ -251,10 +258,21 @@ class LoopDetector:
         for visit in visits:
             result = self._frontend.recognize(visit.place, place, observations)
             if isinstance(result, RelativePose):
-                loops.append(_loop(visit.place.stamp_ns, place.stamp_ns, result))
+                loops.append(self._loop(visit, place, result))
                 if self._world in self._connected:
                     break
         return loops
+
+    def _loop(self, visit: _Visit, place: Any, result: RelativePose) -> Loop:  # noqa: ANN401
+        return Loop(
+            stamp_ns=place.stamp_ns,
+            reference_ns=visit.place.stamp_ns,
+            T_reference_frame=result.T_reference_current,
+            covariance=self.variance_factor * result.covariance,
+            n_matches=result.n_matches,
+            n_inliers=result.n_inliers,
+            reason=_UNCONFIRMED,
+        )
 
     def _keep_oldest_recent(self) -> None:
         """Add the oldest of the latest places to the index, unless another frame knows it."""
@@ -310,7 +328,7 @@ class LoopDetector:
             confirmed.append(loop := replace(loop, reason=""))
         if agreeing and world != reference_world:
             self._connected.add(world)
-        elif world in self._n_searches and loop.reason != _AMBIGUOUS:  # the next may confirm it
+        elif world not in self._connected and loop.reason != _AMBIGUOUS:  # the next may confirm it
             self._n_searches[world] = min(self._n_searches[world], _N_EAGER - _N_WAITING)
         self.loops.latest = *latest, loop
         return confirmed
@@ -428,15 +446,3 @@ class Segments:
         return SegmentJoin(
             segment=segment, to_segment=other, stamp_ns=stamp_ns, reference_ns=reference_ns
         )
-
-
-def _loop(reference_ns: int, stamp_ns: int, result: RelativePose) -> Loop:
-    return Loop(
-        stamp_ns=stamp_ns,
-        reference_ns=reference_ns,
-        T_reference_frame=result.T_reference_current,
-        covariance=result.covariance,
-        n_matches=result.n_matches,
-        n_inliers=result.n_inliers,
-        reason=_UNCONFIRMED,
-    )

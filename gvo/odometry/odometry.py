@@ -529,6 +529,7 @@ class Odometry:
         detector = self._searching()
         if detector is None:
             return ()
+        detector.variance_factor = self._trust.variance_factor
         return detector.look(
             observations,
             T_world_frame,

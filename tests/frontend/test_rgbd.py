@@ -7,7 +7,13 @@ from hypothesis import strategies as st
 
 from gvo.config import Config, DepthConfig
 from gvo.frontend.descriptor import as_stereo
-from gvo.frontend.rgbd import check_depths, compare_depths, grid_points, sample_depth
+from gvo.frontend.rgbd import (
+    check_depths,
+    compare_depths,
+    grid_points,
+    is_seen_again,
+    sample_depth,
+)
 from gvo.geometry import se3
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.types import Contradiction, DepthArray, FloatArray, RelativePose
@@ -240,8 +246,34 @@ def test_what_is_hidden_now_does_not_count() -> None:
     assert check_depths(result, *compared(depth(0), near), CAMERA, CONFIG) is result
 
 
-def test_without_depth_nothing_is_refused() -> None:
+def test_without_depth_nothing_is_refused_and_nothing_seen_again() -> None:
     unknown = np.full_like(depth(1), np.nan)
     result = result_of(np.eye(4))
     for depths in ((unknown, depth(1)), (depth(0), unknown)):
         assert check_depths(result, *compared(*depths), CAMERA, CONFIG) is result
+        assert not is_seen_again(result, *compared(*depths), CAMERA, CONFIG)
+
+
+def boxes() -> DepthArray:
+    """Return the depth of boxes before a wall, which no step aside shows again."""
+    depth = np.full((480, 640), 3.0, dtype=np.float32)
+    corners = np.random.default_rng(3).integers([0, 0], [400, 560], size=(12, 2))
+    for number, (v, u) in enumerate(corners):
+        depth[v : v + 110, u : u + 110] = 1.2 + 0.12 * number
+    return depth
+
+
+@pytest.mark.parametrize(
+    ("metres", "turn", "is_seen"),
+    [(0.0, 0.0, True), (0.02, 0.01, True), (0.4, 0, False), (0, 0.3, False)],
+)
+def test_a_place_is_seen_again_from_where_it_was(metres: float, turn: float, is_seen: bool) -> None:
+    T = se3.exp(np.array([0.0, turn, 0.0, metres, 0.0, 0.0]))
+    points = grid_points(boxes(), CAMERA, CONFIG)
+    # The camera has not moved; by the result it has.
+    assert is_seen_again(result_of(T), points, boxes(), CAMERA, CONFIG) is is_seen
+
+
+def test_a_wall_is_no_place() -> None:
+    wall = np.full((480, 640), 2.0, dtype=np.float32)
+    assert not is_seen_again(result_of(np.eye(4)), *compared(wall, wall), CAMERA, CONFIG)
