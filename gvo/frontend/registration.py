@@ -48,8 +48,8 @@ _MIN_INLIER_SHARE = 0.2
 # reach 0.16 and the same place, seen from 10 m behind, 0.26; in a room it has 0.45.
 _MIN_SHARE_OF_VIEW = 0.25
 # Share where the depth images agree on the rest: what is blurred is not found, however near. Of
-# pairs of three recordings from the hand whose descriptors agree on a motion, all of which are
-# right, 0.63 reach the share above and 0.95 this one.
+# pairs of three recordings from the hand whose descriptors agree on the right motion 0.61 reach
+# the share above, and 0.93 this one.
 _MIN_SHARE_BESIDE_DEPTH = 0.08
 _MIN_DEPTH_M = 1e-3
 # Bands of rows, and by how much fewer of them inliers may be spread over than matches. In steps

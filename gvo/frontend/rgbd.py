@@ -32,7 +32,7 @@ _MIN_POINTS = 100
 _MIN_AGREEING = 0.5
 # Share that agrees where a place is seen again, and on average at most after steps to four sides,
 # relative to the median depth. Of pairs of three recordings from the hand 0.8 agree at the true
-# motion, at wrong ones 0.6 at most in nineteen of twenty; after steps aside mostly 0.5 to 0.7.
+# motion, at wrong ones 0.6 at most in nineteen of twenty; after steps aside mostly 0.4 to 0.7.
 _MIN_SAME, _MAX_ASIDE = 0.8, 0.8
 _STEPS_ASIDE = 0.2 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
 

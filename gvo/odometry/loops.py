@@ -196,9 +196,8 @@ class LoopDetector:
         if world != self._world:
             self._leave_world()
         self._world = world
-        shows_latest = self._shows_latest(T_world_frame)
-        is_search = self._is_search(world, shows_latest=shows_latest)
-        is_place = is_keyframe and not shows_latest
+        is_search = self._is_search(world, T_world_frame)
+        is_place = is_keyframe and not self._shows_latest(T_world_frame)
         if not (is_search or is_place):
             return ()
         describe = self._describe_densely if is_search else self._frontend.describe
@@ -231,7 +230,7 @@ class LoopDetector:
         while self._recent:
             self._keep_oldest_recent()
 
-    def _is_search(self, world: int, *, shows_latest: bool) -> bool:
+    def _is_search(self, world: int, T_world_frame: FloatArray) -> bool:
         """Tell whether a frame of a world searches all others: until it is connected, and eagerly.
 
         Once it is connected, a frame that shows what another one showed would only repeat it.
@@ -239,7 +238,8 @@ class LoopDetector:
         if not self._visits:
             self._connected.add(world)
         n_searches = self._n_searches.setdefault(world, 0 if self._visits else _N_EAGER)
-        if world in self._connected and (shows_latest or n_searches >= _N_EAGER):
+        is_late = n_searches >= _N_EAGER
+        if world in self._connected and (is_late or self._shows_latest(T_world_frame)):
             return False
         self._n_paused += 1
         if self._n_paused <= min(n_searches - _N_EAGER, _MAX_PAUSE):
