@@ -65,8 +65,10 @@ class TrajectoryError(GvoError):
 
 
 @contextmanager
-def named_faults(kind: type[GvoError], where: object, what: str = "") -> Iterator[None]:
-    """Raise errors of the operating system as a `GvoError`.
+def named_faults(
+    kind: type[GvoError], where: object, what: str = "", others: tuple[type[Exception], ...] = ()
+) -> Iterator[None]:
+    """Raise errors of the operating system, and others, as a `GvoError`.
 
     Parameters
     ----------
@@ -75,20 +77,26 @@ def named_faults(kind: type[GvoError], where: object, what: str = "") -> Iterato
         Named in the message; of what the error itself names the file, if `what` is omitted.
     what : str
         Could not be done, as in "cannot be written".
+    others : tuple of type
+        Of a library.
     """
     try:
         yield
-    except OSError as error:
+    except (OSError, *others) as error:  # type: ignore[misc]  # a tuple of types
         if isinstance(error, BrokenPipeError) and not what:
             raise
-        name = where if what or error.filename is None else error.filename
-        reason = f"{what}: {error.strerror or error}" if what else error.strerror or error
+        filename = getattr(error, "filename", None)
+        name = where if what or filename is None else filename
+        reason = getattr(error, "strerror", None) or error
+        reason = f"{what}: {reason}" if what else reason
         raise kind(f"{name}: {reason}") from error
 
 
-def write_faults(kind: type[GvoError], where: object) -> AbstractContextManager[None]:
-    """Raise errors of the operating system as a `GvoError`: a file or folder cannot be written."""
-    return named_faults(kind, where, "cannot be written")
+def write_faults(
+    kind: type[GvoError], where: object, *others: type[Exception]
+) -> AbstractContextManager[None]:
+    """Raise errors of the system, and others, as a `GvoError`: `where` cannot be written."""
+    return named_faults(kind, where, "cannot be written", others)
 
 
 def missing_extra(what: str, extra: str) -> ConfigurationError:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rosbags.rosbag1 import WriterError as WriterError1
 from rosbags.rosbag2 import WriterError as WriterError2
 
-from gvo.errors import RecordingError
+from gvo.errors import RecordingError, write_faults
 from gvo.geometry.camera import Calibration
 from gvo.io.convert import bag_messages, common
 from gvo.io.convert.bag_messages import BagWriter, FramePose, Header
@@ -69,31 +69,26 @@ def write_bag(
         no image can be read.
     """
     path = Path(path)
-    _check_target(path)
-    writer = _Writer(source, plan_streams(source, rectify=rectify, compress=compress))
-    try:
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".convert-") as folder:
-            with BagWriter(Path(folder) / path.name, keeps_order=True) as bag:
-                writer.write(bag, progress)
-            bag.result.rename(path)
-    except (OSError, WriterError1, WriterError2) as error:
-        detail = getattr(error, "strerror", None) or error
-        raise RecordingError(f"{path}: cannot be written: {detail}") from error
-    return common.Conversion(
-        path=path,
-        n_images=sum(writer.n_images),
-        n_poses=writer.n_poses,
-        skipped=writer.left_out.lines(),
-    )
-
-
-def _check_target(path: Path) -> None:
     common.check_new(path)
     if path.suffix not in _SUFFIXES:
         raise RecordingError(
             f"{path}: expected a name ending in .bag, .mcap or .db3, or a folder name without "
             f"a suffix, got {path.suffix}; give --layout for the folder of a data set"
         )
+    writer = _Writer(source, plan_streams(source, rectify=rectify, compress=compress))
+    with (
+        write_faults(RecordingError, path, WriterError1, WriterError2),
+        tempfile.TemporaryDirectory(dir=path.parent, prefix=".convert-") as folder,
+    ):
+        with BagWriter(Path(folder) / path.name, keeps_order=True) as bag:
+            writer.write(bag, progress)
+        bag.result.rename(path)
+    return common.Conversion(
+        path=path,
+        n_images=sum(writer.n_images),
+        n_poses=writer.n_poses,
+        skipped=writer.left_out.lines(),
+    )
 
 
 class _Writer:

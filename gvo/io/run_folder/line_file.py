@@ -6,7 +6,7 @@ import io
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 from gvo.errors import OutputError, RecordingError, write_faults
@@ -150,21 +150,16 @@ class PartFile:
 
     def __init__(self, path: Path, *errors: type[Exception]) -> None:
         self.path = path
-        self._errors: tuple[type[Exception], ...] = (OSError, *errors)
+        self._errors = errors
         check_new(path)
         with self.refused_on_error():
             path.parent.mkdir(parents=True, exist_ok=True)
             self._folder = tempfile.TemporaryDirectory(dir=path.parent, prefix=".gvo-part-")
         self.part = Path(self._folder.name) / path.name
 
-    @contextmanager
-    def refused_on_error(self) -> Iterator[None]:
+    def refused_on_error(self) -> AbstractContextManager[None]:
         """Raise a RecordingError where it cannot be written."""
-        try:
-            yield
-        except self._errors as error:
-            detail = getattr(error, "strerror", None) or error
-            raise RecordingError(f"{self.path}: cannot be written: {detail}") from error
+        return write_faults(RecordingError, self.path, *self._errors)
 
     @contextmanager
     def completed(self, *, is_kept: bool) -> Iterator[None]:
