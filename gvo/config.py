@@ -439,22 +439,16 @@ def load_configuration(path: Path | None = None, settings: Sequence[str] = ()) -
     for setting in settings:
         key, separator, text = setting.partition("=")
         section, dot, name = key.strip().partition(".")
+        shown = f"--set {cut(setting, MAX_SHOWN)}"
         if not separator or not dot:
             raise ConfigurationError(
-                f"--set {cut(setting, MAX_SHOWN)}: expected section.key=value, for example "
-                "window.n_links=3"
+                f"{shown}: expected section.key=value, for example window.n_links=3"
             )
-        values.setdefault(section, {})[name] = _parse_value(setting, text)
+        try:
+            values.setdefault(section, {})[name] = load_yaml(text)
+        except YamlError as error:
+            raise ConfigurationError(f"{shown}: the value is no YAML ({error})") from error
     return validate_configuration(values)
-
-
-def _parse_value(setting: str, text: str) -> object:
-    try:
-        return load_yaml(text)
-    except YamlError as error:
-        raise ConfigurationError(
-            f"--set {cut(setting, MAX_SHOWN)}: the value is no YAML ({error})"
-        ) from error
 
 
 def _read_yaml(path: Path) -> dict[str, dict[str, object]]:
@@ -641,8 +635,9 @@ def _shown(section: str, key: str, field: Any) -> Parameter:  # noqa: ANN401
     if start is None:
         start = _STARTS.get((section, key), 1.0)
     span = math.inf if lower is None or upper is None else upper - lower
-    is_slider = kind in ("integer", "number") and span <= _WIDEST_SLIDER
-    step = _step(kind, float(start) if _is_number(start) else 0.0, span)
+    is_number = kind in ("integer", "number")
+    is_slider = is_number and span <= _WIDEST_SLIDER
+    step = _step(kind, float(start) if is_number else 0.0, span)
     if lower is not None and ">" in limits and (is_slider or kind == "integer"):
         lower += step
     return Parameter(
@@ -659,11 +654,6 @@ def _shown(section: str, key: str, field: Any) -> Parameter:  # noqa: ANN401
         start=start,
         hint=f"{describe_field(field)}; default {default}",
     )
-
-
-def _is_number(value: object) -> bool:
-    """Tell whether a value is a number; True and False are none."""
-    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _kind(annotation: Any) -> Kind:  # noqa: ANN401
