@@ -77,6 +77,8 @@ class RunLoop:
 
     Attributes
     ----------
+    excerpt : Excerpt
+        Which frames are read.
     statistics : RunStatistics
         Counts so far.
     output_faults : list of str
@@ -101,7 +103,7 @@ class RunLoop:
     ) -> None:
         self.source, self.config, self.base_frame = source, config, base_frame
         self.statistics = RunStatistics()
-        self._excerpt = excerpt or Excerpt()
+        self.excerpt = excerpt or Excerpt()
         self._first_pose, self._items, self._through = first_pose, items, through
         self._read_ms = 0.0
         self._first_ns: int | None = None
@@ -132,11 +134,6 @@ class RunLoop:
     def is_placed(self) -> bool:
         """Tell whether an initial pose was asked for: the world is not that of the first frame."""
         return self.base_frame.is_placed or self._first_pose is not None
-
-    @property
-    def is_excerpt(self) -> bool:
-        """Tell whether a part of the recording is read."""
-        return not self._excerpt.is_everything
 
     def run(
         self, outputs: Iterable[Output], on_progress: Callable[[Progress], None] | None
@@ -229,15 +226,15 @@ class RunLoop:
         if self._first_ns is None:
             self._first_ns = stamp_ns
         if n_done < 2:
-            return self._excerpt.n_expected(n_images)
-        period_s = 1e-9 * (stamp_ns - self._first_ns) / (n_done - 1) / self._excerpt.every
+            return self.excerpt.n_expected(n_images)
+        period_s = 1e-9 * (stamp_ns - self._first_ns) / (n_done - 1) / self.excerpt.every
         length_s = max(period_s, 0.0) * n_images
-        return self._excerpt.n_expected(n_images, length_s=length_s or None)
+        return self.excerpt.n_expected(n_images, length_s=length_s or None)
 
     def _read(self) -> Iterator[Frame | FaultyFrame]:
         items = self._items
         if items is None:
-            items = frames(self.source, self.config, self._excerpt, through=self._through)
+            items = frames(self.source, self.config, self.excerpt, through=self._through)
         iterator = iter(items)
         while True:
             start = time.perf_counter()

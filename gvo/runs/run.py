@@ -266,7 +266,7 @@ def _within(truth: Truth, folder: RunFolder, loop: RunLoop) -> Truth:
     trajectory = truth.trajectory
     if trajectory.stamps_from == "rows" and len(trajectory) == len(stamps_ns):
         trajectory = Trajectory(stamps_ns=stamps_ns, T_world_frame=trajectory.T_world_frame)
-    if loop.is_excerpt and trajectory.stamps_from != "rows":
+    if not loop.excerpt.is_everything and trajectory.stamps_from != "rows":
         first, last = stamps_ns.min() - MAX_DIFFERENCE_NS, stamps_ns.max() + MAX_DIFFERENCE_NS
         start, end = np.searchsorted(trajectory.stamps_ns, [first, last])
         trajectory = trajectory.select(slice(int(start), int(end)))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from gvo.errors import ConfigurationError, RecordingError, write_faults
@@ -140,17 +141,12 @@ def name_frames(
     ConfigurationError
         When a frame's name is invalid.
     """
-    try:
-        frames = _named(source, base_frame, is_placed=is_placed, world=world)
-        return replace(frames, is_robot=is_robot)
-    except ValueError as error:
-        raise ConfigurationError(f"--world {world}: {error}") from error
-
-
-def _named(source: Source, base_frame: BaseFrame, *, is_placed: bool, world: str) -> RunFrames:
-    camera = source.info.frame_id
-    if base_frame.is_camera:
-        return RunFrames(world=world, camera=camera, is_world_optical=not is_placed)
+    make = partial(RunFrames, world=world, camera=source.info.frame_id, is_robot=is_robot)
     fixed = base_frame.fixed_mount
     mount = base_frame.T_base_cam if fixed is None else fixed
-    return RunFrames(world=world, camera=camera, base=base_frame.name, T_base_cam=mount)
+    try:
+        if base_frame.is_camera:
+            return make(is_world_optical=not is_placed)
+        return make(base=base_frame.name, T_base_cam=mount)
+    except ValueError as error:
+        raise ConfigurationError(f"--world {world}: {error}") from error
