@@ -57,19 +57,17 @@ class FilePipe:
     ----------
     error : OSError or None
         Why the file could not be written, once it could not.
+    entrance : Path
+        The path to open for writing, once.
     """
 
     def __init__(self, path: Path) -> None:
         self.error: OSError | None = None
         self._file = path.open("wb", buffering=0)
         self._reader, self._writer = os.pipe()
+        self.entrance = Path(f"/dev/fd/{self._writer}")
         self._thread = Thread(target=self._copy, name="gvo-file-pipe", daemon=True)
         self._thread.start()
-
-    @property
-    def entrance(self) -> Path:
-        """The path to open for writing, once."""
-        return Path(f"/dev/fd/{self._writer}")
 
     def leave(self) -> None:
         """Close this end: the file ends when the writer closes its own."""
@@ -290,7 +288,9 @@ class RerunWriter:
         self._indices.append(self._n_seen)
         self.add_status(frame.stamp_ns, result.status, "; ".join(caption(result)))
         self._add_poses(result)
-        self._add_picture(frame, image, result)
+        overlay = compose_overlay(frame, result, self._camera, index=self._n_seen - 1)
+        self.stream.log(OVERLAY, make_image(overlay))
+        self.stream.log(f"{_CAMERA}/image", make_image(halve(image)))
         self._add_points(image, result)
         self._add_links(result)
         self._add_numbers(result)
@@ -359,11 +359,6 @@ class RerunWriter:
             self._recent[name].append(estimate.T_world_frame[:3, 3])
         if callable(self._frames.T_base_cam):
             self.stream.log(_CAMERA, make_transform(self._frames.mount(result.stamp_ns)))
-
-    def _add_picture(self, frame: Frame, image: ImageArray, result: FrameResult) -> None:
-        overlay = compose_overlay(frame, result, self._camera, index=self._n_seen - 1)
-        self.stream.log(OVERLAY, make_image(overlay))
-        self.stream.log(f"{_CAMERA}/image", make_image(halve(image)))
 
     def _add_points(self, image: ImageArray, result: FrameResult) -> None:
         found = result.registration or NOTHING
