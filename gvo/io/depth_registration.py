@@ -60,7 +60,9 @@ class DepthRegistration:
     """
 
     def __init__(self, color: Calibration, view: DepthView) -> None:
-        _check_rigid(view.T_color_depth)
+        fault = se3.transform_fault(view.T_color_depth)
+        if fault:
+            raise ValueError(f"T_color_depth {fault}, got {view.T_color_depth.tolist()}")
         self._shape = (color.height, color.width)
         self._depth_shape = (view.calibration.height, view.calibration.width)
         self._is_done = _is_done(color, view)
@@ -136,12 +138,6 @@ def _close_gaps(painted: DepthArray, square: NDArray[np.uint8]) -> DepthArray:
     closed = np.where(is_gap, opened, painted)
     closed[closed == _NOTHING] = np.nan
     return closed
-
-
-def _check_rigid(T: FloatArray) -> None:
-    fault = se3.transform_fault(T)
-    if fault:
-        raise ValueError(f"T_color_depth {fault}, got {T.tolist()}")
 
 
 def _is_done(color: Calibration, view: DepthView) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -157,15 +158,13 @@ def _stereo_set(cameras: list[DescribedCamera], origin: str, *, is_rectified: bo
         )
     left, right = cameras[:2]
     T_left_right, key = _extrinsics(left, right)
-    if T_left_right is None:
-        pair = (
-            make_calibration(left.fields, is_rectified=is_rectified),
-            make_calibration(right.fields, is_rectified=is_rectified),
-        )
-        key = "P"
-    else:
-        raw = [make_calibration(camera.fields, is_rectified=False) for camera in (left, right)]
-        pair = pair_of_extrinsics((raw[0], raw[1]), T_left_right, origin)
+    is_rectified = is_rectified and T_left_right is None
+    pair = (
+        make_calibration(left.fields, is_rectified=is_rectified),
+        make_calibration(right.fields, is_rectified=is_rectified),
+    )
+    if T_left_right is not None:
+        pair = pair_of_extrinsics(pair, T_left_right, origin)
     stereo_baseline(pair, origin)
     return CameraSet(
         calibrations=pair, origin=origin, baseline_from=key, T_body_cam=_on_body(left, pair[0])
@@ -178,7 +177,7 @@ def _extrinsics(left: DescribedCamera, right: DescribedCamera) -> tuple[FloatArr
         return se3.invert(right.T_cam_previous), "T_cn_cnm1"
     if left.T_body_cam is not None and right.T_body_cam is not None:
         return se3.invert(left.T_body_cam) @ right.T_body_cam, "the poses of both on the body"
-    return None, ""
+    return None, "P"
 
 
 def _rgbd_set(
@@ -451,8 +450,4 @@ class _Loader(yaml.SafeLoader):
     """Reads the matrices of OpenCV as the keys that they consist of."""
 
 
-def _keys_of_matrix(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
-    return loader.construct_mapping(node, deep=True)
-
-
-_Loader.add_constructor(_OPENCV_MATRIX, _keys_of_matrix)
+_Loader.add_constructor(_OPENCV_MATRIX, partial(_Loader.construct_mapping, deep=True))

@@ -11,7 +11,6 @@ from gvo._text import cut, plain_number
 from gvo.config import Config
 from gvo.errors import CalibrationError, RecordingError
 from gvo.geometry import se3
-from gvo.geometry.camera import Calibration
 from gvo.io.calibration.camera_info import check_camera, rectified_calibration, stereo_baseline
 from gvo.io.calibration.files import CalibrationPaths, CameraSet, paths_of, read_cameras
 from gvo.io.datasets.files import FolderSource, StampedPath, loader, read_rows, read_stamped_rows
@@ -59,7 +58,9 @@ class KittiSource(FolderSource):
         else:
             size = _image_size([path for _, path in images[names[0]]], config)
             cameras = _read_cameras(files[0], names, size)
-        self._t_cam0_cam = _camera_offset(cameras.calibrations[0])
+        P = cameras.calibrations[0].P
+        # The centre of the camera in the frame of cam0: P = K [I | -centre].
+        self._t_cam0_cam = np.asarray(-np.linalg.solve(P[:, :3], P[:, 3]))
         state = "rectified" if cameras.calibrations[0].is_rectified else "raw"
         decisions = [
             f"calibration: {' + '.join(file.name for file in files)}, {state}",
@@ -168,8 +169,3 @@ def _read_projections(path: Path) -> dict[str, FloatArray]:
             )
         projections[fields[0].rstrip(":")] = projection.reshape(3, 4)
     return projections
-
-
-def _camera_offset(calibration: Calibration) -> FloatArray:
-    """Return the centre of the camera in the frame of cam0: P = K [I | -centre]."""
-    return np.asarray(-np.linalg.solve(calibration.P[:, :3], calibration.P[:, 3]))

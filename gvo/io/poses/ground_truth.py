@@ -165,17 +165,13 @@ def read_bag_truth(
     return (_of_positions if topic.type in POSITION_TYPES else _of_poses)(reader, topic)
 
 
-def _reason(buffer: TfBuffer, spec: TfTruth, stamp_ns: int) -> str:
-    found = buffer.lookup(spec.parent, spec.child, stamp_ns)
-    return found.reason if isinstance(found, Failure) else "they do not move in tf"
-
-
 def _of_chain(buffer: TfBuffer, spec: TfTruth, where: str) -> BagTruth:
     stamps_ns = buffer.edge_stamps_ns(spec.parent, spec.child)
     T_parent_child, is_known = buffer.lookup_many(spec.parent, spec.child, stamps_ns)
     if not np.any(is_known):
         at_ns = int(stamps_ns[0]) if len(stamps_ns) else 0
-        reason = _reason(buffer, spec, at_ns)
+        found = buffer.lookup(spec.parent, spec.child, at_ns)
+        reason = found.reason if isinstance(found, Failure) else "they do not move in tf"
         raise RecordingError(
             f"{where}: holds no poses of {spec.child} in {spec.parent}: "
             f"{'; '.join([reason, *buffer.notes])}"
