@@ -314,11 +314,7 @@ def _bound_chunks() -> None:
     for name in ("bz2", "lz4"):
         decompressors[name] = partial(inflate_whole, compression=name)
     for name in ("lz4", "zstd"):
-        DECOMPRESSORS[name] = partial(_inflate_to, compression=name)
-
-
-def _inflate_to(data: bytes, size: int, *, compression: str) -> bytes:
-    return inflate_whole(data, compression, limit=size)
+        DECOMPRESSORS[name] = partial(inflate_whole, compression=name)
 
 
 _bound_chunks()

@@ -160,16 +160,16 @@ def inflate(window: Window, compression: str, *, limit: int = MAX_INFLATED) -> t
     return b"".join(parts), True
 
 
-def inflate_whole(data: bytes, compression: str, *, limit: int | None = None) -> bytes:
+def inflate_whole(data: bytes, limit: int | None = None, *, compression: str) -> bytes:
     """Decompress complete data, of one stream or of several in a row.
 
     Parameters
     ----------
     data : bytes
-    compression : str
-        "bz2", "lz4" or "zstd".
     limit : int, optional
         Maximum number of decompressed bytes, up to `MAX_INFLATED`.
+    compression : str
+        "bz2", "lz4" or "zstd".
 
     Raises
     ------
