@@ -76,17 +76,13 @@ def find_recordings(asked: Sequence[str | Path]) -> list[NamedRecording]:
         raise ValueError("expected at least one recording")
     locations: dict[str, None] = {}
     for one in asked:
-        found = _expand(str(one))
+        text = str(one)
+        is_list = not is_url(text) and text.endswith(_LIST_SUFFIX) and Path(text).is_file()
+        found = list(_read_list(Path(text)) if is_list else _search(text))
         if not found:
             raise RecordingError(f"{one}: no recording there")
         locations.update(dict.fromkeys(found))
     return _name(list(locations))
-
-
-def _expand(text: str) -> list[str]:
-    if not is_url(text) and text.endswith(_LIST_SUFFIX) and Path(text).is_file():
-        return list(_read_list(Path(text)))
-    return list(_search(text))
 
 
 def _read_list(path: Path) -> Iterator[str]:

@@ -180,8 +180,10 @@ class _Table:
     @contextmanager
     def written(self) -> Iterator[None]:
         """Mark the folder; write table and report at the end, also after an exception."""
-        with self._folder() as folder:
-            self._mark(folder)
+        content = {"mark": self.mark, "gvo_version": __version__, "n_runs": len(self._places)}
+        with self._folder() as folder, write_faults(OutputError, folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            replace_text(folder / MARK, json.dumps(content) + "\n")
         try:
             yield
         finally:
@@ -199,12 +201,6 @@ class _Table:
         with tempfile.TemporaryDirectory(prefix="gvo-") as copies:
             yield Path(copies)
             store(Path(copies), self.location)
-
-    def _mark(self, folder: Path) -> None:
-        content = {"mark": self.mark, "gvo_version": __version__, "n_runs": len(self._places)}
-        with write_faults(OutputError, folder):
-            folder.mkdir(parents=True, exist_ok=True)
-            replace_text(folder / MARK, json.dumps(content) + "\n")
 
     def _draw(self, folder: Path) -> None:
         from gvo.batch.report.report import write_batch_report
