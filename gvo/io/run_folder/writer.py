@@ -57,14 +57,9 @@ EDGES_HEADER = ("stamp_ns", "reference_ns", "kind", "is_accepted", "chi2")
 _STAGES = ("read", "extract", "register", "links", "window", "loops")
 TIMINGS_HEADER = ("stamp_ns", *(f"{stage}_ms" for stage in _STAGES))
 
-_OF_EARLIER_RUNS = (
+_RESULTS = (
     *(SUMMARY, "edges.csv", "timings.csv", PICTURE, REPORT, ROUND_TRIP_PICTURE),
     *(TRUTH, TRUE_POSITIONS, GRAPH, LOOPS, f"{GLOBAL}.txt"),
-)
-
-
-_RESULTS = (
-    *_OF_EARLIER_RUNS,
     "frames.csv",
     *(f"{name}.txt" for name in TRAJECTORIES),
     "explanation.json",
@@ -189,7 +184,6 @@ class RunFolder(AbstractContextManager["RunFolder"]):
     ) -> None:
         self.path = path
         self._is_writable = True
-        self._names = names
         self._files: dict[str, LineFile] = {}
         with ExitStack() as stack, self._refused_on_error(path):
             path.mkdir(parents=True, exist_ok=True)
@@ -197,18 +191,15 @@ class RunFolder(AbstractContextManager["RunFolder"]):
             for name in (*_RESULTS, *covariances):
                 (path / name).unlink(missing_ok=True)
             stack.callback(self._close_files)
-            self._open_all(columns)
+            for name in names:
+                self._open(f"{name}.txt", "")
+                if names is TRAJECTORIES:
+                    self._open_covariances(name)
+            self._open("frames.csv", _csv_line(columns))
+            if columns is FRAMES_HEADER:
+                self._open("edges.csv", _csv_line(EDGES_HEADER))
+                self._open("timings.csv", _csv_line(TIMINGS_HEADER))
             stack.pop_all()
-
-    def _open_all(self, columns: Sequence[str]) -> None:
-        for name in self._names:
-            self._open(f"{name}.txt", "")
-            if self._names is TRAJECTORIES:
-                self._open_covariances(name)
-        self._open("frames.csv", _csv_line(columns))
-        if columns is FRAMES_HEADER:
-            self._open("edges.csv", _csv_line(EDGES_HEADER))
-            self._open("timings.csv", _csv_line(TIMINGS_HEADER))
 
     @contextmanager
     def _refused_on_error(self, path: Path) -> Iterator[None]:
