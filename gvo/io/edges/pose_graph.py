@@ -15,7 +15,7 @@ from gvo._text import text_lines
 from gvo.errors import OutputError, TrajectoryError, write_faults
 from gvo.io.edges.events import EdgeEvent, Event, InputFaults, PoseEvent, anchor, inverted
 from gvo.trajectory import g2o
-from gvo.types import Edge, FloatArray, FrameId, PosePrior
+from gvo.types import Edge, FloatArray, FrameId
 
 _SECOND_NS = 1_000_000_000
 _TAG = re.compile(r"[A-Z][A-Z0-9_]*(:[A-Z0-9_]+)*$")
@@ -61,15 +61,11 @@ class PoseGraphSource:
         self._n_vertices = 0
         self._scan()
         self.n_poses = self._n_vertices
+        origin = "where its vertex is" if self._start_id in self._fixed else "the origin"
         self.decisions = [
             "stamps: the order of the poses, a second each; a g2o file has none",
-            f"world: pose {self._start_id} is {self._origin()}",
+            f"world: pose {self._start_id} is {origin}",
         ]
-
-    def _origin(self) -> str:
-        if self._start_id is None or self._start_id not in self._fixed:
-            return "the origin"
-        return "where its vertex is"
 
     def events(self) -> Iterator[Event]:
         """Yield poses and edges in file order.
@@ -235,9 +231,12 @@ class _Connector:
 
     def take(self, line: g2o.Measurement) -> Iterator[Event]:
         ends = (line.reference_id, line.frame_id)
-        if self._pending is not None and self._joins_pending(ends):
-            self._pending[1].append(line)
-            return
+        if self._pending is not None:
+            frame_id, lines = self._pending
+            others = [end for end in ends if end != frame_id]
+            if len(others) == 1 and others[0] in self._known:
+                lines.append(line)
+                return
         yield from self.flush()
         unknown = [end for end in ends if end not in self._known]
         if not unknown:
@@ -256,11 +255,6 @@ class _Connector:
         (frame_id, lines), self._pending = self._pending, None
         yield self._pose(frame_id, lines)
         yield from self._connect(frame_id)
-
-    def _joins_pending(self, ends: tuple[int, int]) -> bool:
-        frame_id = self._pending[0] if self._pending is not None else None
-        others = [end for end in ends if end != frame_id]
-        return len(others) == 1 and others[0] in self._known
 
     def _connect(self, frame_id: int) -> Iterator[Event]:
         """Yield what waited for a pose, and for the poses that come of it."""
@@ -282,9 +276,7 @@ class _Connector:
 
     def _pose(self, frame_id: int, lines: list[g2o.Measurement]) -> PoseEvent:
         self._known.add(frame_id)
-        prior: PosePrior | None = None
-        if frame_id in self._fixed:
-            prior = anchor(self._fixed[frame_id])
+        fixed = self._fixed.get(frame_id)
         return PoseEvent(
             frame_id=frame_id,
             stamp_ns=next(self._stamps_ns),
@@ -292,7 +284,7 @@ class _Connector:
                 _edge(line) if line.frame_id == frame_id else inverted(_edge(line), line.frame_id)
                 for line in lines
             ),
-            prior=prior,
+            prior=None if fixed is None else anchor(fixed),
         )
 
 
@@ -343,6 +335,7 @@ class GraphFile:
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / GRAPH
+        self._part = self._path.with_suffix(".g2o.part")
         with self._refused_on_error():
             folder.mkdir(parents=True, exist_ok=True)
             self._path.unlink(missing_ok=True)
@@ -350,10 +343,6 @@ class GraphFile:
 
     def _refused_on_error(self) -> AbstractContextManager[None]:
         return write_faults(OutputError, self._path)
-
-    @property
-    def _part(self) -> Path:
-        return self._path.with_suffix(".g2o.part")
 
     def add(self, stamp_ns: int, frame_id: FrameId, T_world_frame: FloatArray) -> None:
         """Write a smoothed pose, named by a whole number; they may come in any order."""
