@@ -144,8 +144,13 @@ class KittiFolder(FolderStreams):
         """Write stamps and calibration."""
         lines = [f"{format_stamp(stamp_ns)}\n" for stamp_ns in self._stamps_ns]
         (self._folder / "times.txt").write_text("".join(lines), encoding="utf-8")
+        # P of left and right: `PN` of `image_N`.
         names = self._folders or ("image_0", "image_1")
-        _write_projections(self._folder / "calib.txt", names, self.calibrations)
+        lines = [
+            f"P{name[-1]}: {' '.join(map(repr, _numbers(calibration.P)))}\n"
+            for name, calibration in zip(names, self.calibrations, strict=True)
+        ]
+        (self._folder / "calib.txt").write_text("".join(lines), encoding="utf-8")
 
 
 class EurocFolder(FolderStreams):
@@ -280,17 +285,6 @@ def _choose_scale(depth: DepthArray) -> float | None:
             return scale
     farthest = _RESERVE * float(np.nanmax(depth))
     return DEFAULT_SCALE if DEFAULT_SCALE * farthest < MAX_COUNT else MILLIMETRES
-
-
-def _write_projections(
-    path: Path, names: tuple[str, str], calibrations: tuple[Calibration, ...]
-) -> None:
-    """Write the P of left and right as the `calib.txt` of a KITTI folder: `PN` of `image_N`."""
-    lines = [
-        f"P{name[-1]}: {' '.join(repr(float(value)) for value in calibration.P.ravel())}\n"
-        for name, calibration in zip(names, calibrations, strict=True)
-    ]
-    path.write_text("".join(lines), encoding="utf-8")
 
 
 def _write_sensor_yaml(path: Path, calibration: Calibration, T_body_sensor: FloatArray) -> None:
