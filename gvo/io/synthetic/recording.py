@@ -19,7 +19,7 @@ from gvo.io.synthetic.rendering import scale_camera, to_uint8
 from gvo.io.synthetic.scene import Scene
 from gvo.io.synthetic.worlds import deceptive, motion, room, street
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import BoolArray, DepthArray, FloatArray, ImageArray, IntArray
+from gvo.types import BoolArray, DepthArray, FloatArray, IntArray
 
 _EXPOSURE_PERIOD_S = 7.3
 _BLOB_PX = 14
@@ -187,9 +187,6 @@ class SyntheticRecording:
         rng = np.random.default_rng([self._seed, index, stream])
         if stream == 1 and self._sensor == "rgbd":
             return spoil_depth(self.render_depth(index), self._noise, rng)
-        return self._load_image(index, stream, rng)
-
-    def _load_image(self, index: int, stream: int, rng: np.random.Generator) -> ImageArray:
         T_map_cam, camera = self._view(index, stream)
         elapsed_s = self._elapsed_s(index)
         grey = self._moving_scene.render_image(elapsed_s, T_map_cam, camera)
