@@ -100,25 +100,19 @@ def write_comparison_report(
     asked_m = evaluations[0].segments_m if evaluations else None
     world = World.of(truth)
     shown = truth_around(truth, [c.reference for c in compared])
+    names = ", ".join(trajectories)
+    facts = {"Estimates": names, "Poses of the reference": str(len(truth)), "Alignment": align}
     with settings():
         lines = lines_of(shown, {c.name: c.trajectory for c in compared})
         sheets = path_plots(lines, world) + error_plots(compared, align)
         sheets.append(drift_plot(compared, asked_m=asked_m))
         if path is not None:
-            names = ", ".join(trajectories)
-            head = _comparison_head(names, truth, evaluations, align)
+            table = page.table_html(*evaluation_table(evaluations))
+            head = ["<h1>Comparison of trajectories</h1>", page.facts_html(facts), table]
             body = [*head, *page.plots_html(sheets, lines, world)]
             page.write_page(Path(path), f"Comparison: {names}", body)
         if plots is not None:
             write_plots(sheets, Path(plots))
-
-
-def _comparison_head(
-    names: str, truth: Trajectory, evaluations: Sequence[Evaluation], align: AlignMode
-) -> list[str]:
-    facts = {"Estimates": names, "Poses of the reference": str(len(truth)), "Alignment": align}
-    table = page.table_html(*evaluation_table(evaluations))
-    return ["<h1>Comparison of trajectories</h1>", page.facts_html(facts), table]
 
 
 def truth_around(truth: Trajectory, parts: Sequence[Trajectory]) -> Trajectory:

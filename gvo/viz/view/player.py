@@ -266,8 +266,7 @@ class Player(AbstractContextManager["Player"]):
     def frame_view(self) -> FrameView | None:
         """The frame shown; None before there is any."""
         history = self.history
-        is_any = history.shown >= history.first_index
-        return history.frame_view() if is_any else None
+        return history.frame_view() if history.shown >= history.first_index else None
 
     # On the thread
 
