@@ -310,10 +310,8 @@ class Stretches:
             is_back = newest_ns is not None and image.stamp_ns < newest_ns - _BACK_NS
             if self._is_cut or (is_back and late):
                 self._held.extend([*late, image])
-                is_asked = self._is_cut
-                self.reason = (
-                    "it was reset" if is_asked else f"the stamps go back to {image.stamp_ns} ns"
-                )
+                back = f"the stamps go back to {image.stamp_ns} ns"
+                self.reason = "it was reset" if self._is_cut else back
                 return
             if is_back:
                 late.append(image)
