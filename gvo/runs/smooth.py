@@ -272,10 +272,9 @@ def _conclude(
         raise _nothing_to_smooth(notes)
     estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
     summary = {**_summary(smoother), "configuration": smoother.config.model_dump()}
-    warnings = [*_broken_off(smoother.n_poses, notes), *_warnings(smoother), *notes.warnings]
-    counts = smoother.window.counts
-    is_complete = not (notes.broken_off or notes.warnings or counts.n_coasting or counts.n_rejected)
-    return _written(folder, summary, estimates, truth, warnings, is_complete, on_written)
+    is_complete = not (smoother.window.counts.n_coasting or smoother.window.counts.n_rejected)
+    warnings = list(_warnings(smoother))
+    return _written(folder, summary, estimates, truth, notes, warnings, is_complete, on_written)
 
 
 def _nothing_to_smooth(notes: SmoothingNotes) -> RecordingError:
@@ -289,41 +288,40 @@ def _written(
     summary: dict[str, Any],
     estimates: dict[str, Trajectory],
     truth: Trajectory | None,
+    notes: SmoothingNotes,
     warnings: list[str],
     is_complete: bool,
     on_written: Callable[[], None] | None,
 ) -> RunResult:
-    """Compare with the truth, write summary and picture."""
-    evaluations, fault = _compare(truth, estimates)
-    warnings = [*warnings, *([fault] if fault else [])]
+    """Compare with the truth, write summary and picture; `warnings` are of the smoothing itself."""
+    evaluations = _compare(truth, estimates, notes)
+    if notes.broken_off:
+        cut = f"the input broke off after {summary['frames']} poses: {notes.broken_off}"
+        warnings = [cut, *warnings]
+    warnings = [*warnings, *notes.warnings]
     summary |= {"errors": evaluations_json(evaluations)["estimates"], "warnings": warnings}
     with _poses_counted(folder.path):
         folder.write_summary(summary)
         if on_written is not None:
             on_written()
         plot_trajectories(folder.path / PICTURE, truth if evaluations else None, estimates)
-    is_complete &= not fault
+    is_complete &= not (notes.broken_off or notes.warnings)
     return RunResult(
         summary=summary, evaluations=evaluations, is_complete=is_complete, warnings=tuple(warnings)
     )
 
 
-def _broken_off(n_poses: int, notes: SmoothingNotes) -> list[str]:
-    if not notes.broken_off:
-        return []
-    return [f"the input broke off after {n_poses} poses: {notes.broken_off}"]
-
-
 def _compare(
-    truth: Trajectory | None, estimates: dict[str, Trajectory]
-) -> tuple[tuple[Evaluation, ...], str]:
-    """Return the errors, or a warning that says why there are none."""
+    truth: Trajectory | None, estimates: dict[str, Trajectory], notes: SmoothingNotes
+) -> tuple[Evaluation, ...]:
+    """Return the errors; where there are none, the notes say why."""
     if truth is None:
-        return (), ""
+        return ()
     try:
-        return tuple(evaluate(truth, e, name=name) for name, e in estimates.items()), ""
+        return tuple(evaluate(truth, e, name=name) for name, e in estimates.items())
     except GvoError as error:
-        return (), f"not compared with the ground truth: {error}"
+        notes.warnings.append(f"not compared with the ground truth: {error}")
+        return ()
 
 
 def _warnings(smoother: Smoother) -> Iterator[str]:
@@ -504,10 +502,9 @@ def optimize_edges(
             _write_poses(graph, optimizer, folder, file)
     estimates = {"raw": optimizer.trajectory(of=optimizer.raw), "smoothed": smoothed}
     truth = _with_stamps(ground_truth, source, folder)
-    warnings = [*_broken_off(len(graph.frame_ids), notes), *_batch_warnings(graph, optimizer)]
-    warnings += notes.warnings
+    warnings = list(_batch_warnings(graph, optimizer))
     summary = _batch_summary(graph, optimizer, robust, notes)
-    return _written(folder, summary, estimates, truth, warnings, not warnings, on_written)
+    return _written(folder, summary, estimates, truth, notes, warnings, not warnings, on_written)
 
 
 def _write_poses(
