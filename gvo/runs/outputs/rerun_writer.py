@@ -8,7 +8,7 @@ from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from threading import Thread
-from typing import Final, TypeAlias
+from typing import Final
 
 import cv2
 import numpy as np
@@ -33,7 +33,7 @@ from gvo.types import (
     Status,
 )
 from gvo.viz import palette
-from gvo.viz.overlay import NOTHING, caption, compose_overlay, placed_matches
+from gvo.viz.overlay import NOTHING, Colour, caption, compose_overlay, placed_matches
 
 _N_BYTES: Final = 2**20
 
@@ -421,8 +421,6 @@ class RerunWriter:
             positions = np.array(recent).reshape(-1, 3)
             self.stream.log(f"world/{name}/recent", make_path(name, positions))
 
-
-Colour: TypeAlias = tuple[int, int, int]
 
 KEYFRAMES: Final = "keyframes"
 N_SIGMAS: Final = 3.0
