@@ -211,8 +211,11 @@ class PoseGraph:
         turns = [after[key].compose(pose.inverse()) for key, pose in before.items()]
         turn = max(turns, key=_angle, default=gtsam.Pose3())
         if _angle(turn) > _FAR:
+            former, error = self._isam, self.error()
             self._update_turned(turn, alive, leaving)
             self._settle(poses, alive, leaving)
+            if not self.error() < error:  # no part of the graph turned as a whole
+                self._isam = former
         return True
 
     def _settle(
@@ -296,6 +299,10 @@ class PoseGraph:
     def factors(self) -> gtsam.NonlinearFactorGraph:
         """Return all factors, marginals among them."""
         return self._isam.getFactorsUnsafe()
+
+    def error(self) -> float:
+        """Return half the sum of the squared whitened residuals."""
+        return float(self.factors().error(self.values()))
 
     def values(self) -> gtsam.Values:
         """Return all poses."""

@@ -718,6 +718,8 @@ class RunGraph:
         for loop in loops:
             if loop.stamp_ns in self._keyframes and loop.reference_ns in self._keyframes:
                 graph.add_edges(loop.stamp_ns, [loop.edge])
+        for each in graph.rejected:
+            raise SmoothingError(f"an edge between keyframes is invalid: {each.reason}")
         return graph
 
     def _possible(self) -> tuple[list[Loop], set[tuple[object, int]], set[tuple[object, int]]]:

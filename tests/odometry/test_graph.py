@@ -228,6 +228,17 @@ def test_a_failure_on_the_way_is_a_warning(
     np.testing.assert_array_equal(drive.graph.T_map_world, np.eye(4))
 
 
+def test_an_edge_beyond_all_bounds_is_an_error() -> None:
+    drive = looped(0)
+    drive.sigmas = 1e9 * SIGMAS
+    n = len(drive.truth)
+    drive.truth = np.append(drive.truth, drive.truth[-5:], axis=0)
+    for j in range(n, n + 5):
+        drive.step(j)
+    with pytest.raises(SmoothingError, match="between keyframes is invalid: its sigma"):
+        drive.graph.optimize()
+
+
 def test_a_map_does_not_grow_with_laps_of_the_same_block(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(graph_module, "_N_LATEST", 10)
     monkeypatch.setattr(graph_module, "_MAX_LINKED", 0)
