@@ -16,6 +16,15 @@ _ANY_TURN = np.pi / np.sqrt(3.0)
 _ANYWHERE_M = 1e5
 
 
+def velocity_of(T_last_frame: FloatArray, elapsed_s: float) -> FloatArray:
+    """Return the twist per second of a step.
+
+    One of less than a millisecond, as between stamps of arrival, counts as one of a millisecond:
+    its noise over its time would be a velocity of kilometres per second.
+    """
+    return se3.log(T_last_frame) / max(elapsed_s, _MIN_ELAPSED_S)
+
+
 def predict_step(
     velocity: FloatArray | None, elapsed_s: float, config: WindowConfig, *, coasted_s: float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
@@ -163,4 +172,4 @@ class ConstantVelocity:
         if self._step is None:
             return None
         T_world_before, T_world_last, elapsed_s = self._step
-        return se3.log(se3.invert(T_world_before) @ T_world_last) / elapsed_s
+        return velocity_of(se3.invert(T_world_before) @ T_world_last, elapsed_s)

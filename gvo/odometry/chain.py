@@ -9,7 +9,7 @@ from typing import Generic
 import numpy as np
 
 from gvo.backend.factors import find_faults
-from gvo.backend.motion_model import MAX_EXTRAPOLATION_S, StatusClock, predict_step
+from gvo.backend.motion_model import MAX_EXTRAPOLATION_S, StatusClock, predict_step, velocity_of
 from gvo.config import WindowConfig
 from gvo.frontend.protocol import Frontend, ObservationsT
 from gvo.geometry import se3
@@ -317,7 +317,7 @@ class RawChain(Generic[ObservationsT]):
 
     def _note_velocity(self, poses: PoseChain, result: RelativePose, elapsed_s: float) -> bool:
         """Take over the velocity of a registration; tell whether it is steady."""
-        poses.velocity = se3.log(result.T_reference_current) / elapsed_s
+        poses.velocity = velocity_of(result.T_reference_current, elapsed_s)
         sigmas = np.sqrt(np.diagonal(result.covariance)) / elapsed_s
         return self._recent.add(poses.newest.stamp_ns, poses.velocity, sigmas)
 
@@ -435,7 +435,7 @@ class EdgeChain:
             estimate = chain.append(reference, stamp_ns, edge.T_reference_frame, edge.covariance)
             elapsed_s = 1e-9 * (stamp_ns - newest.stamp_ns)
             T_newest_frame = se3.invert(newest.T_world_frame) @ estimate.T_world_frame
-            chain.velocity = se3.log(T_newest_frame) / elapsed_s if elapsed_s > 0 else None
+            chain.velocity = velocity_of(T_newest_frame, elapsed_s) if elapsed_s > 0 else None
         elif isinstance(prior, PosePrior):
             T, covariance = prior.T_world_frame, prior.covariance
             chain.start(Estimate(stamp_ns=stamp_ns, T_world_frame=T, covariance=covariance))

@@ -336,7 +336,7 @@ class RunGraph:
         frames, step = self._condense(newest)
         for row in frames:
             self._frames.append(row[1], *row)
-        self._way = self._way.then(step)
+        self._way = self._way.then(self._bounded(stamp_ns, step))
         self._know(newest, step, n_frames=len(frames))
         self._arrivals, self._adrift = [], set()
 
@@ -417,12 +417,12 @@ class RunGraph:
             stamp_ns = int(frame_id)  # type: ignore[call-overload]
             edge = _edge(origin_ns, T, covariance)
             if newest is not None and stamp_ns == newest.stamp_ns:
-                edge = step = self._step(stamp_ns, edge)
+                step, edge = edge, self._bounded(stamp_ns, edge)
             self._add_edge(stamp_ns, edge)
         return rows, step
 
-    def _step(self, stamp_ns: int, edge: Edge) -> Edge:
-        """Return the edge to a new keyframe; what is guessed is bounded."""
+    def _bounded(self, stamp_ns: int, edge: Edge) -> Edge:
+        """Return the edge to a new keyframe, for the graph: the sigmas of a guess are bounded."""
         if stamp_ns not in self._guesses:
             return edge
         variances = np.minimum(np.diagonal(edge.covariance), _GUESS_SIGMAS**2)

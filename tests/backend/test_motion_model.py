@@ -111,3 +111,17 @@ def test_where_nothing_is_known_of_the_motion_the_camera_stands() -> None:
     assert motion.predict_step(3 * STEP_NS)[0][0, 3] != pytest.approx(0.0)
     motion.append(estimate(5, 5 * STEP_NS, T, np.eye(6)), is_measured=True)
     np.testing.assert_array_equal(motion.predict_step(6 * STEP_NS)[0], np.eye(4))
+
+
+def test_two_images_that_arrived_at_once_do_not_throw_the_camera_away() -> None:
+    motion = ConstantVelocity(WindowConfig())
+    last = moving(motion, np.eye(4), np.array([0, 0, 0, 0, 0, 1.0]), 3)[-1]
+    T = last.T_world_frame @ se3.exp(np.array([0, 0, 0, 1e-3, 0, 0]))  # noise
+    next_ns = last.stamp_ns + 100
+    motion.append(
+        estimate(3, next_ns, T, 1e-4 * np.eye(6)),
+        is_measured=True,
+        T_world_measured=last.T_world_frame,
+    )
+    T_last_frame, covariance = motion.predict_step(next_ns + STEP_NS)
+    assert np.linalg.norm(T_last_frame[:3, 3]) < np.sqrt(covariance[3, 3])

@@ -147,6 +147,20 @@ def test_frames_after_a_loss_go_with_what_comes_after_it(is_changed: bool) -> No
     assert max(float(np.trace(each.covariance)) for each in optimum.estimates) < 0.1
 
 
+def test_covariances_are_proper_through_ten_seconds_in_the_dark() -> None:
+    truth = np.array([se3.exp(np.array([0, 0, 0, 0, 0, 1.0 * j])) for j in range(120)])
+    graph = RunGraph(WindowConfig())
+    for j, T in enumerate(truth):
+        is_dark = 10 <= j <= 110
+        edges = [] if is_dark or j == 0 else [measured(truth, j - 1, j, SIGMAS, None)]
+        status = Status.LOST if is_dark else Status.OK
+        graph.add_frame(estimate_at(j * PERIOD_NS, T, status=status), edges, is_keyframe=False)
+    covariances = np.array([each.covariance for each in graph.optimize().estimates[1:]])
+    assert np.linalg.eigvalsh(covariances).min() > 0.0
+    # The guess between both ends is a guess still.
+    assert np.sqrt(np.linalg.eigvalsh(covariances[50]).max()) > 10.0
+
+
 def test_an_optimum_on_the_way_changes_nothing_that_comes_later() -> None:
     asked, other = (Drive(block(1.3, n_per_lap=N_LAP), np.random.default_rng(2)) for _ in range(2))
     for j in range(len(asked.truth)):

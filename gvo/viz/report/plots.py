@@ -260,7 +260,7 @@ def _ribbon(frames: FrameTable) -> Figure:
 def _spans(x: FloatArray, is_there: Any) -> list[tuple[float, float]]:  # noqa: ANN401
     """Return start and width of each stretch of a status, at least a column wide."""
     extent = max(float(x[-1] - x[0]), 1e-9)
-    step = float(np.median(np.diff(x))) if len(x) > 1 else extent
+    step = float(np.median(np.diff(np.unique(x)))) if x[-1] > x[0] else extent
     n_columns = max(1, min(_N_RIBBON, round(extent / step) + 1))
     marks = np.zeros(n_columns + 2, dtype=np.int64)
     marks[1 + sheets.columns_of(x, n_columns)[is_there]] = 1

@@ -331,7 +331,7 @@ def _segment_words(segments: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _duration(record: RunRecord) -> str:
-    stamps_ns = record.frames.stamps_ns
+    stamps_ns = np.unique(record.frames.stamps_ns)  # repeated ones are skipped
     if len(stamps_ns) < 2:
         return ""
     rate = 1e9 / float(np.median(np.diff(stamps_ns)))

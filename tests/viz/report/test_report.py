@@ -206,6 +206,13 @@ def test_each_status_has_a_row_with_its_count(copy: Path) -> None:
         assert f">{label}</text>" in text
 
 
+def test_frames_that_came_twice_have_a_row(copy: Path) -> None:
+    rows = (copy / "frames.csv").read_text().splitlines()
+    repeated = [rows[1].replace(",ok,", ",skipped,")] * 20
+    (copy / "frames.csv").write_text("\n".join([*rows[:2], *repeated, *rows[2:], ""]))
+    assert ">skipped: 20</text>" in page_of(copy)
+
+
 def test_what_differs_from_the_default_is_marked_with_the_default(page: Path, copy: Path) -> None:
     assert 'class="changed"' not in page.read_text()
     rewrite_summary(copy, configuration={"window": {"n_links": 7, "n_keyframes": 20}})
