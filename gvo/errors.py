@@ -78,7 +78,7 @@ def named_faults(
     what : str
         Could not be done, as in "cannot be written".
     others : tuple of type
-        Of a library.
+        Types of errors that a library raises for it.
     """
     try:
         yield

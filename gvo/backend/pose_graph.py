@@ -186,7 +186,8 @@ class PoseGraph:
         """Repeat the last update until poses converge, if it moved them far.
 
         One step of Gauss-Newton is exact only for motions by a fraction of a radian; closing a
-        loop takes a few. A whole graph is left to the batch optimization at its end.
+        loop takes a few. If a part of the graph turned far, its marginals are turned with it,
+        unless that fits worse. A whole graph is left to the batch optimization at its end.
 
         Parameters
         ----------
@@ -214,7 +215,7 @@ class PoseGraph:
             former, error = self._isam, self.error()
             self._update_turned(turn, alive, leaving)
             self._settle(poses, alive, leaving)
-            if not self.error() < error:  # no part of the graph turned as a whole
+            if not self.error() < error:
                 self._isam = former
         return True
 

@@ -170,7 +170,8 @@ class _Channel:
     def repeat(self) -> None:
         """Send the last message again, where it is latched; those who have it, have it twice."""
         if self._last is not None:
-            self.publish(*self._last)
+            data, stamp_ns = self._last
+            self.channel.log(data, log_time=stamp_ns)
 
 
 class _Listener(ServerListener):

@@ -430,7 +430,8 @@ class RunGraph:
 
     def _add_edge(self, frame_ns: int, edge: Edge) -> None:
         number = next(self._numbers)
-        self._edges[number] = frame_ns, edge
+        T = se3.normalize(edge.T_reference_frame)  # of a whole way between keyframes
+        self._edges[number] = frame_ns, replace(edge, T_reference_frame=T)
         for stamp_ns in (frame_ns, int(edge.reference_id)):  # type: ignore[call-overload]
             self._touching.setdefault(stamp_ns, {})[number] = None
 
@@ -576,7 +577,7 @@ class RunGraph:
         Raises
         ------
         SmoothingError
-            If GTSAM fails, or the graph is empty.
+            If GTSAM fails, the graph is empty, or no valid edge leads to a keyframe.
         """
         if not self._keyframes:
             raise SmoothingError("the graph of the run is empty: no frame has come (loops.enabled)")
@@ -610,6 +611,8 @@ class RunGraph:
         graph = self._whole(loops, refused=refused)
         firsts = self._bridge(graph)
         optimizer = BatchOptimizer(graph)
+        if len(optimizer.numbers) < len(self._keyframes):
+            raise SmoothingError(f"a keyframe has no valid edge: {graph.rejected[0]}")
         error_before = optimizer.starts["odometry"]
         optimizer.run()
         poses = dict(zip(self._keyframes, optimizer.poses(), strict=True))
@@ -718,8 +721,6 @@ class RunGraph:
         for loop in loops:
             if loop.stamp_ns in self._keyframes and loop.reference_ns in self._keyframes:
                 graph.add_edges(loop.stamp_ns, [loop.edge])
-        for each in graph.rejected:
-            raise SmoothingError(f"an edge between keyframes is invalid: {each.reason}")
         return graph
 
     def _possible(self) -> tuple[list[Loop], set[tuple[object, int]], set[tuple[object, int]]]:

@@ -314,7 +314,7 @@ def _written(
 def _compare(
     truth: Trajectory | None, estimates: dict[str, Trajectory], notes: SmoothingNotes
 ) -> tuple[Evaluation, ...]:
-    """Return the errors; where there are none, the notes say why."""
+    """Return the errors; where they cannot be computed, a warning is added to the notes."""
     if truth is None:
         return ()
     try:

@@ -5,6 +5,7 @@ import errno
 import gc
 import logging
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -249,8 +250,26 @@ def test_an_edge_beyond_all_bounds_is_an_error() -> None:
     drive.truth = np.append(drive.truth, drive.truth[-5:], axis=0)
     for j in range(n, n + 5):
         drive.step(j)
-    with pytest.raises(SmoothingError, match="between keyframes is invalid: its sigma"):
+    with pytest.raises(SmoothingError, match=r"a keyframe has no valid edge: .* its sigma"):
         drive.graph.optimize()
+
+
+def test_rotations_that_are_not_quite_orthonormal_add_up_to_no_invalid_edge() -> None:
+    drive, graph = looped(0), RunGraph(WindowConfig())
+    for j, edges in enumerate(drive.edges):
+        scale = np.diag([1.0 + 2e-7, 1.0 + 2e-7, 1.0 + 2e-7, 1.0])
+        scaled = [replace(e, T_reference_frame=e.T_reference_frame @ scale) for e in edges]
+        T_world_frame = drive.truth[j]
+        graph.add_frame(estimate_at(j * PERIOD_NS, T_world_frame), scaled, is_keyframe=j % 20 == 0)
+    assert not graph._whole([]).rejected
+
+
+def test_one_invalid_loop_costs_no_poses() -> None:
+    drive = looped(0)
+    expected = poses(drive.graph.optimize())
+    first, *rest = drive.graph.loops
+    drive.graph.loops = [replace(first, covariance=1e13 * np.eye(6)), *rest]
+    np.testing.assert_allclose(poses(drive.graph.optimize()), expected, atol=0.1)
 
 
 def test_a_map_does_not_grow_with_laps_of_the_same_block(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -172,7 +172,7 @@ def _stereo_set(cameras: list[DescribedCamera], origin: str, *, is_rectified: bo
 
 
 def _extrinsics(left: DescribedCamera, right: DescribedCamera) -> tuple[FloatArray | None, str]:
-    """Return T_left_right of the raw cameras and the key that told it."""
+    """Return T_left_right of the raw cameras, None if unknown, and the key that tells about it."""
     if right.T_cam_previous is not None:
         return se3.invert(right.T_cam_previous), "T_cn_cnm1"
     if left.T_body_cam is not None and right.T_body_cam is not None:
