@@ -171,6 +171,7 @@ class _Channel:
         """Send the last message again, where it is latched; those who have it, have it twice."""
         if self._last is not None:
             data, stamp_ns = self._last
+            # Not published: that would put it in the place of what another thread sends meanwhile.
             self.channel.log(data, log_time=stamp_ns)
 
 

@@ -422,7 +422,7 @@ class RunGraph:
         return rows, step
 
     def _bounded(self, stamp_ns: int, edge: Edge) -> Edge:
-        """Return the edge to a new keyframe, for the graph: the sigmas of a guess are bounded."""
+        """Return the edge to a new keyframe as graph and way have it: a guess is bounded."""
         if stamp_ns not in self._guesses:
             return edge
         variances = np.minimum(np.diagonal(edge.covariance), _GUESS_SIGMAS**2)
