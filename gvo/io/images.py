@@ -6,14 +6,14 @@ import os
 import re
 import stat
 import struct
-from collections.abc import Iterator, Sequence
+import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
-from isal import isal_zlib
 from numpy.typing import NDArray
 
 from gvo.errors import RecordingError
@@ -24,15 +24,7 @@ MAX_PIXELS = 100_000_000
 
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"IEND"
-_PNG_SUB = 1  # filter of a row: differences from the pixel to the left
-_MAX_SUMMED = 1 << 25  # bytes of rows of differences whose sums, four times as many, are held
-_MAX_STORED = 65535  # bytes of a stored block
-_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by the type of colour
-# Of each pass of an interlaced image: the first column and row, the steps of both.
-_PNG_PASSES = (
-    *((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4)),
-    *((0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2)),
-)
+_N_AT_ONCE = 4096  # bytes of which zlib makes a checksum without giving Python's lock away
 _JPEG_MAGIC = b"\xff\xd8\xff"
 _TIFF_MAGICS = {b"II*\0": "<", b"MM\0*": ">"}
 _BMP_MAGIC = b"BM"
@@ -199,7 +191,7 @@ def decode_image(data: NDArray[np.uint8], where: str) -> NDArray[Any]:
     if is_complete is not None and not is_complete(data):
         raise RecordingError(f"{where}: the {header.format} image is truncated or damaged")
     try:
-        pixels = _decode_png(data) if header.format == "PNG" else _decode_by_opencv(data)
+        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise RecordingError(f"{where}: the image cannot be decoded") from error
     if pixels is None or pixels.size == 0:
@@ -517,8 +509,12 @@ def is_png_complete(data: NDArray[np.uint8]) -> bool:
 
 
 def _is_png_chunk_sound(chunk: memoryview) -> bool:
-    check, name = int.from_bytes(chunk[-4:], "big"), chunk[4:8].tobytes()
-    return name != b"IDAT" or isal_zlib.crc32(chunk[4:-4]) == check
+    if chunk[4:8].tobytes() != b"IDAT":
+        return True
+    content, check = chunk[4:-4], 0
+    for first in range(0, len(content), _N_AT_ONCE):
+        check = zlib.crc32(content[first : first + _N_AT_ONCE], check)
+    return check == int.from_bytes(chunk[-4:], "big")
 
 
 def _png_chunks(data: NDArray[np.uint8]) -> Iterator[tuple[bytes, int, int]]:
@@ -529,87 +525,6 @@ def _png_chunks(data: NDArray[np.uint8]) -> Iterator[tuple[bytes, int, int]]:
         name, end = head[4:], start + 12 + int.from_bytes(head[:4], "big")
         yield name, start, end
         start = end
-
-
-def _decode_by_opencv(data: NDArray[np.uint8]) -> NDArray[Any] | None:
-    return cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
-
-
-def _decode_png(data: NDArray[np.uint8]) -> NDArray[Any] | None:
-    """Decode a PNG; None where OpenCV cannot.
-
-    libpng inflates all that follows the rows, up to a thousand times its bytes. It is given them
-    uncompressed and cut there, what is malformed as it is, and what OpenCV wrote not at all.
-    """
-    parts, contents = list[bytes | memoryview]([_PNG_MAGIC]), list[memoryview]()
-    n_bytes = _n_png_bytes(data[8:33].tobytes())
-    for name, start, end in _png_chunks(data):
-        if name in (b"IHDR", b"PLTE", b"tRNS"):
-            parts.append(data[start:end].tobytes())
-        elif name == b"IDAT":
-            contents.append(data.data[start + 8 : end - 4])
-    stream, inflater = b"".join(contents), isal_zlib.decompressobj()
-    try:
-        rows = inflater.decompress(stream, n_bytes) if n_bytes else b""
-    except isal_zlib.error:  # type: ignore[misc]  # a class, the stub has an instance
-        rows = b""
-    if not rows or len(rows) < n_bytes:
-        return _decode_by_opencv(data)
-    pixels = _unfiltered(parts[1], rows) if len(parts) == 2 else None
-    if pixels is not None:
-        return pixels
-    end = len(stream) - len(inflater.unused_data)
-    check = stream[end - 4 : end] if inflater.eof else struct.pack(">I", isal_zlib.adler32(rows))
-    stored = [stream[:2], *_stored(rows), check]
-    parts += [*_png_chunk(b"IDAT", stored), *_png_chunk(_PNG_END, [])]
-    return _decode_by_opencv(np.frombuffer(b"".join(parts), dtype=np.uint8))
-
-
-def _unfiltered(header: bytes | memoryview, rows: bytes) -> NDArray[Any] | None:
-    """Return the pixels of rows of differences, as OpenCV writes them; None of other rows."""
-    width, height, depth, colour, *methods = struct.unpack(">IIBBBBB", header[8:21])
-    n = {(8, 0): 1, (8, 2): 3, (16, 0): 2}.get((depth, colour), 0)
-    if n == 0 or any(methods) or len(rows) > _MAX_SUMMED:
-        return None
-    filtered = np.frombuffer(rows, dtype=np.uint8).reshape(height, 1 + n * width)
-    if np.any(filtered[:, 0] != _PNG_SUB):
-        return None
-    # Sums along rows, modulo 256, by those over rectangles: ten times as fast as in bytes.
-    differences = np.ascontiguousarray(filtered[:, 1:]).reshape(height, width, n)
-    sums = cv2.integral(differences).reshape(height + 1, width + 1, n).astype(np.uint8)
-    pixels = sums[1:, 1:] - sums[:-1, 1:]
-    if depth == 16:
-        return np.asarray(pixels.view(">u2")[:, :, 0].astype(np.uint16))
-    return cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if n == 3 else pixels[:, :, 0]
-
-
-def _stored(content: bytes) -> Iterator[bytes | memoryview]:
-    """Yield content as stored blocks of a stream, which a compressor at level 0 copies twice."""
-    for first in range(0, len(content), _MAX_STORED):
-        block = memoryview(content)[first : first + _MAX_STORED]
-        is_last = first + _MAX_STORED >= len(content)
-        yield struct.pack("<BHH", is_last, len(block), len(block) ^ 0xFFFF)
-        yield block
-
-
-def _n_png_bytes(header: bytes) -> int:
-    """Return the bytes of all rows, each with the byte of its filter; 0 of a wrong header."""
-    if not header.startswith(b"\0\0\0\rIHDR") or header[16] not in (1, 2, 4, 8, 16):
-        return 0
-    width, height, depth, colour, _, _, is_interlaced = struct.unpack(">IIBBBBB", header[8:21])
-    n_bits = depth * _PNG_CHANNELS.get(colour, 0)
-    sizes = (
-        (-(-(width - u) // step_u), -(-(height - v) // step_v))
-        for u, v, step_u, step_v in (_PNG_PASSES if is_interlaced else ((0, 0, 1, 1),))
-    )
-    return sum(h * (1 + (w * n_bits + 7) // 8) for w, h in sizes if min(w, h, n_bits) > 0)
-
-
-def _png_chunk(name: bytes, contents: Sequence[bytes | memoryview]) -> list[bytes | memoryview]:
-    check = isal_zlib.crc32(name)
-    for content in contents:
-        check = isal_zlib.crc32(content, check)
-    return [struct.pack(">I", sum(map(len, contents))), name, *contents, struct.pack(">I", check)]
 
 
 _COMPLETE = {"JPEG": is_jpeg_complete, "PNG": is_png_complete}
