@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 from typing import TypeAlias
 
@@ -157,8 +158,8 @@ def _write_levels(block: ImageArray, pixels: ImageArray, starts: IntArray) -> No
     for x, x_end in pairwise(starts):
         level = narrow
         for y, y_end in pairwise(starts):
-            padded = np.pad(np.rint(level), 1, mode="wrap")
-            block[y:y_end, x:x_end] = padded.astype(np.uint8)
+            rounded = np.asarray(cv2.convertScaleAbs(level))
+            block[y:y_end, x:x_end] = np.pad(rounded, 1, mode="wrap")
             level = 0.5 * (level[0::2] + level[1::2])
         narrow = 0.5 * (narrow[:, 0::2] + narrow[:, 1::2])
 
@@ -197,13 +198,19 @@ def noise(rng: np.random.Generator, *, exponent: float = 1.0, largest: float = 0
     largest : float
         Largest wavelength as a share of the canvas.
     """
-    f_x = fft.rfftfreq(N_TEXELS) * N_TEXELS
-    f_y = fft.fftfreq(N_TEXELS)[:, np.newaxis] * N_TEXELS
-    f = np.hypot(f_x, f_y).astype(np.float32)
-    amplitudes = np.where(f < 1.0 / largest, 0.0, np.maximum(f, 1.0) ** np.float32(-exponent))
+    f = _frequencies()
+    half = np.where(f < 1.0 / largest, 0.0, np.maximum(f, 1.0) ** np.float32(-exponent))
+    amplitudes = np.concatenate([half, half[-2:0:-1]])  # those of -f_y are those of f_y
     white = fft.rfft2(rng.standard_normal((N_TEXELS, N_TEXELS), dtype=np.float32))
     field = fft.irfft2(white * amplitudes.astype(np.float32), s=(N_TEXELS, N_TEXELS))
     return np.asarray(field / field.std(), dtype=np.float32)
+
+
+@cache
+def _frequencies() -> Canvas:
+    """Return the frequency of each amplitude, rows from zero to the highest alone."""
+    f = np.arange(N_TEXELS // 2 + 1)
+    return np.hypot(f, f[:, np.newaxis]).astype(np.float32)
 
 
 def bricks(
@@ -221,13 +228,17 @@ def bricks(
     shift : float
         Of every second row, in bricks.
     """
-    y = np.arange(N_TEXELS)[:, np.newaxis] * (n_rows / N_TEXELS)
+    y = np.arange(N_TEXELS) * (n_rows / N_TEXELS)
     row = y.astype(np.int64)
-    x = np.arange(N_TEXELS) * (n_columns / N_TEXELS) + shift * (row % 2)
-    tones = rng.standard_normal((n_rows, n_columns))
+    # Of an even and of an odd row: each texel of a row has its place in one of these.
+    x = np.arange(N_TEXELS) * (n_columns / N_TEXELS) + shift * np.array([[0], [1]])
+    tones = rng.standard_normal((n_rows, n_columns)).astype(np.float32)
     wide, high = N_TEXELS / n_columns, N_TEXELS / n_rows
-    is_joint = ((x % 1.0) * wide < joint) | ((y % 1.0) * high < joint)
-    return np.where(is_joint, -3.0, tones[row, x.astype(np.int64) % n_columns]).astype(np.float32)
+    columns = x.astype(np.int64) % n_columns
+    canvas = tones[row[:, np.newaxis], columns[row % 2]]
+    canvas[((x % 1.0) * wide < joint)[row % 2]] = -3.0
+    canvas[(y % 1.0) * high < joint] = -3.0
+    return canvas
 
 
 def fill(canvas: Canvas, box: Box, grey: float | Canvas) -> None:
