@@ -23,6 +23,7 @@ IndexArray: TypeAlias = NDArray[np.int16]
 Plane: TypeAlias = tuple[FloatArray, FloatArray]
 _Box: TypeAlias = tuple[slice, slice]
 _Pixels: TypeAlias = tuple[IntArray, IntArray]
+_Span: TypeAlias = tuple[IndexArray, IndexArray]
 
 NOTHING = -1
 _NEAR_M = 0.05
@@ -151,7 +152,7 @@ class View:
         return forms[self.camera.height // 2] if self.is_rolling else forms
 
     def along_rows(self, forms: FloatArray, k: int, rows: IntArray) -> tuple[FloatArray, ...]:
-        """Return slopes along u, (..., 1 or n_rows), and values at u = 0, (..., n_rows).
+        """Return slopes along u, (1 or n_rows), and values at u = 0, (n_rows).
 
         Parameters
         ----------
@@ -161,9 +162,7 @@ class View:
             The rectangle.
         rows : ndarray of int64, shape (n_rows,)
         """
-        chosen = forms[rows, k] if self.is_rolling else forms[np.newaxis, k]
-        # `moveaxis` would take longer than the arithmetic.
-        a, b, c = (chosen[..., axis].T for axis in range(3))
+        a, b, c = forms[rows, k].T if self.is_rolling else forms[k, :, np.newaxis]
         return a, b * rows + c
 
 
@@ -317,25 +316,29 @@ def find_visible(view: View) -> IndexArray:
     """
     nearest = np.zeros((view.camera.height, view.camera.width), dtype=np.float32)
     visible = np.full(nearest.shape, NOTHING, dtype=np.int16)
-    first, last, upper_bounds = _bounds_by_rows(view) if view.is_rolling else _bounds(view)
+    spans = _row_spans(view)
+    first, last, upper_bounds = _bounds_by_rows(view, *spans) if view.is_rolling else _bounds(view)
     # Front to back, cut-outs last: what is hidden is found out early.
     for k in np.lexsort((-upper_bounds, view.scene.has_mask[view.indices])):
         box = slice(first[k, 1], last[k, 1]), slice(first[k, 0], last[k, 0])
         behind = nearest[box]
         if behind.size > 0 and behind.min() < upper_bounds[k]:
-            _draw(view, int(k), _shrink(view, int(k), box, nearest), nearest, visible)
+            box = _shrink(view, int(k), box, nearest)
+            left, right = (bounds[k, box[0], np.newaxis] for bounds in spans)
+            _draw(view, int(k), box, (left, right), nearest, visible)
     return visible
 
 
-def _draw(view: View, k: int, box: _Box, nearest: SampleArray, visible: IndexArray) -> None:
+def _draw(
+    view: View, k: int, box: _Box, span: _Span, nearest: SampleArray, visible: IndexArray
+) -> None:
     """Enter rectangle k into the buffers where it is the nearest one."""
     v, u = (np.arange(part.start, part.stop) for part in box)
     inverse_depths = _evaluate(view, view.inverse_depth, k, (u, v))
     mask = inverse_depths > nearest[box]
-    left, right = _row_spans(view, k, v)
     columns = u.astype(np.int16)
-    mask &= columns >= left[:, np.newaxis]
-    mask &= columns <= right[:, np.newaxis]
+    mask &= columns >= span[0]
+    mask &= columns <= span[1]
     if view.scene.has_mask[view.indices[k]]:
         _cut_out(view, k, (u, v), inverse_depths, mask)
     np.copyto(nearest[box], inverse_depths, where=mask)
@@ -382,32 +385,38 @@ def _bounds(view: View) -> tuple[IntArray, IntArray, FloatArray]:
     return first.astype(np.int64), last.astype(np.int64), np.minimum(over_box, over_points)
 
 
-def _bounds_by_rows(view: View) -> tuple[IntArray, IntArray, FloatArray]:
+def _bounds_by_rows(
+    view: View, left: IndexArray, right: IndexArray
+) -> tuple[IntArray, IntArray, FloatArray]:
     """Return the same for a rolling shutter, of which no corner has one place in the image."""
     n = len(view.indices)
     first, last = np.zeros((n, 2), dtype=np.int64), np.zeros((n, 2), dtype=np.int64)
     upper_bounds = np.zeros(n)
     for k in range(n):
-        left, right = _row_spans(view, k, np.arange(view.camera.height))
-        rows = np.flatnonzero(left <= right)
+        rows = np.flatnonzero(left[k] <= right[k])
         if len(rows) == 0:
             continue
-        left, right = left[rows], right[rows]
+        start, end = left[k, rows], right[k, rows]
         slopes, reach = view.along_rows(view.inverse_depth, k, rows)
-        first[k], last[k] = (left.min(), rows[0]), (right.max() + 1, rows[-1] + 1)
-        upper_bounds[k] = (reach + np.maximum(slopes * left, slopes * right)).max()
+        first[k], last[k] = (start.min(), rows[0]), (end.max() + 1, rows[-1] + 1)
+        upper_bounds[k] = (reach + np.maximum(slopes * start, slopes * end)).max()
     return first, last, upper_bounds
 
 
-def _row_spans(view: View, k: int, rows: IntArray) -> tuple[IndexArray, IndexArray]:
-    """Return the first and the last column inside of rectangle k for each row."""
-    width = view.camera.width
-    a, offsets = view.along_rows(view.inside, k, rows)
-    slopes = np.where(a == 0, 1e-300, a)  # all of the row, or nothing
-    with np.errstate(over="ignore"):
-        bounds = -offsets / slopes
-    lower = np.where(slopes > 0, bounds, 0.0).max(axis=0, initial=0.0)
-    upper = np.where(slopes > 0, np.inf, bounds).min(axis=0, initial=width - 1.0)
+def _row_spans(view: View) -> _Span:
+    """Return the first and the last column inside of each rectangle, shapes (n, height)."""
+    width, height = view.camera.width, view.camera.height
+    rows = np.arange(height)
+    lower = np.zeros((len(view.indices), height))
+    upper = np.full(lower.shape, width - 1.0)
+    for side in range(view.inside.shape[-2]):
+        forms = view.inside[..., side, :].T  # (3, n), of a rolling shutter (3, n, height)
+        a, b, c = forms if view.is_rolling else forms[..., np.newaxis]
+        slopes = np.where(a == 0, 1e-300, a)  # all of the row, or nothing
+        with np.errstate(over="ignore"):
+            bounds = -(b * rows + c) / slopes
+        np.maximum(lower, bounds, out=lower, where=slopes > 0)
+        np.minimum(upper, bounds, out=upper, where=slopes <= 0)
     left, right = np.minimum(np.ceil(lower), width), np.maximum(np.floor(upper), -1)
     return left.astype(np.int16), right.astype(np.int16)
 
