@@ -326,8 +326,8 @@ class RuntimeConfig(Section):
 
     threads: int = _common(
         2,
-        "1: sequential; 2: images decoded ahead; 3: corners detected in parallel too (klt): a "
-        "little faster, a little more CPU time",
+        "1: sequential; 2 and more: images decoded ahead, and left and right described side by "
+        "side (descriptor)",
         ge=1,
         le=64,
     )

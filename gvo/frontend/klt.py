@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal, Protocol, TypeAlias, cast
@@ -104,7 +102,6 @@ class KltFrontend:
         self._calibrated = CalibratedCamera(self.camera, self.rig_offsets)
         self._config = config
         self._depths = DepthAligner(self.camera, config.depth)
-        self._pool = ThreadPoolExecutor(1, "corners") if config.runtime.threads > 2 else None
 
     def extract(self, frame: Frame) -> KltObservations:
         """Return a frame with its corners that are measured in 3-D.
@@ -114,16 +111,10 @@ class KltFrontend:
         frame : StereoFrame or RgbdFrame
         """
         self.rig_offsets.advance()
-        offsets_px = self._offsets_px()
-        if self._pool is not None:
-            pending = self._pool.submit(self._find_corners, frame, *offsets_px)
-            return KltObservations(frame=frame, find_corners=pending.result)
-        corners = self._find_corners(frame, *offsets_px)
-        return KltObservations(frame=frame, find_corners=lambda: corners)
+        return KltObservations(frame=frame, corners=self._find_corners(frame))
 
-    def _find_corners(
-        self, frame: Frame, offset_px: float, row_offset_px: float, klt: KltConfig | None = None
-    ) -> KltCorners:
+    def _find_corners(self, frame: Frame, klt: KltConfig | None = None) -> KltCorners:
+        offset_px, row_offset_px = self._offsets_px()
         corners = detect_corners(image_of(frame), klt or self._config.klt)
         row_px = None
         if isinstance(frame, StereoFrame):
@@ -180,7 +171,7 @@ class KltFrontend:
             result = self._check_depth(reference, current, result)
         if isinstance(result, RelativePose):
             self.rig_offsets.note(result, current.stamp_ns)
-            row_px = reference.find_corners().row_px
+            row_px = reference.corners.row_px
             self.rig_offsets.note_rows(row_px, reference.stamp_ns)
         return result
 
@@ -263,7 +254,7 @@ class KltFrontend:
 
     def describe(self, observations: KltObservations) -> KltPlace:
         """Return a frame as a place: small, but for its image all that `recognize` needs."""
-        return self._describe(observations, observations.find_corners())
+        return self._describe(observations, observations.corners)
 
     def describe_densely(self, observations: KltObservations) -> KltPlace:
         """Return a frame as a place with more corners, which find more of another place's."""
@@ -274,8 +265,7 @@ class KltFrontend:
                 "min_distance_px": 2 * klt.min_distance_px // 3,
             }
         )
-        corners = self._find_corners(observations.frame, *self._offsets_px(), dense)
-        return self._describe(observations, corners)
+        return self._describe(observations, self._find_corners(observations.frame, dense))
 
     def _describe(self, observations: KltObservations, corners: KltCorners) -> KltPlace:
         frame = observations.frame
@@ -446,7 +436,8 @@ class KltFrontend:
     ) -> tuple[FloatArray, FloatArray | None]:
         """Return the warps of patches by a motion; of stereo, slopes of disparities after it."""
         offset = np.array([0.0, 0.0, self.rig_offsets.disparity_px])
-        uvd, slopes = reference.uvd[indices] - offset, reference.find_corners().slopes[indices]
+        uvd = reference.uvd[indices] - offset
+        slopes = reference.slopes[indices].astype(np.float64)
         T_current_reference = se3.invert(T_reference_current)
         warps = patch_warps(uvd, slopes, T_current_reference, self.camera)
         if not self._is_stereo:
@@ -495,7 +486,7 @@ class KltFrontend:
         *,
         n_steps: int,
     ) -> tuple[FloatArray, BoolArray]:
-        templates = frames[0].find_corners().templates.take(indices)
+        templates = frames[0].templates.take(indices)
         pixels, is_found = templates.align(frames[1].image, start, warps, n_steps=n_steps)
         return pixels, is_found & self.camera.is_in_view(pixels)
 
@@ -576,7 +567,11 @@ class _Reference(Protocol):
     @property
     def uvd(self) -> FloatArray: ...
 
-    def find_corners(self) -> KltCorners: ...
+    @property
+    def slopes(self) -> NDArray[np.floating]: ...
+
+    @property
+    def templates(self) -> Templates: ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
@@ -586,13 +581,12 @@ class KltObservations:
     Parameters
     ----------
     frame : StereoFrame or RgbdFrame
-    find_corners : callable
-        Returns its KltCorners, which another thread may still be detecting: they are needed
-        only when the next frame comes.
+    corners : KltCorners
+        Its own, tracked when the next frame comes.
     """
 
     frame: Frame
-    find_corners: Callable[[], KltCorners]
+    corners: KltCorners
 
     @property
     def stamp_ns(self) -> int:
@@ -607,12 +601,12 @@ class KltObservations:
     @property
     def keypoints(self) -> FloatArray:
         """Pixels (u, v) of the corners, shape (n, 2)."""
-        return self.find_corners().keypoints
+        return self.corners.keypoints
 
     @property
     def disparities(self) -> FloatArray:
         """Disparities of the corners as measured, shape (n,)."""
-        return self.find_corners().disparities
+        return self.corners.disparities
 
     @property
     def uvd(self) -> FloatArray:
@@ -622,12 +616,22 @@ class KltObservations:
     @property
     def points_cam(self) -> FloatArray:
         """The corners as points in the `cam` frame, metres, shape (n, 3)."""
-        return self.find_corners().points_cam
+        return self.corners.points_cam
+
+    @property
+    def slopes(self) -> FloatArray:
+        """Changes of the disparities per pixel, along rows and columns, shape (n, 2)."""
+        return self.corners.slopes
+
+    @property
+    def templates(self) -> Templates:
+        """The patches around the corners."""
+        return self.corners.templates
 
     @property
     def n_keypoints(self) -> int:
         """Corners detected, measured or not."""
-        return self.find_corners().n_keypoints
+        return self.corners.n_keypoints
 
     def __len__(self) -> int:
         """Return the number of points."""
@@ -684,16 +688,10 @@ class KltPlace:
         """The corners as points in the `cam` frame, metres, shape (n, 3)."""
         return self.points.astype(np.float64)
 
-    def find_corners(self) -> KltCorners:
-        """Return the corners."""
-        return KltCorners(
-            keypoints=self.keypoints,
-            disparities=self.uvd[:, 2],
-            slopes=self.slopes.astype(np.float64),
-            points_cam=self.points_cam,
-            templates=Templates.of_patches(self.patches),
-            n_keypoints=len(self.uvd),
-        )
+    @property
+    def templates(self) -> Templates:
+        """The patches around the corners, prepared anew."""
+        return Templates.of_patches(self.patches)
 
 
 def image_of(frame: Frame) -> ImageArray:
