@@ -104,6 +104,14 @@ def plain_number(text: str) -> str:
     return text
 
 
+def plain_floats(texts: Sequence[str]) -> list[float]:
+    """Return many numbers; raises ValueError as `plain_number` and `float` do."""
+    joined = "".join(texts)
+    if not joined.isascii() or "_" in joined:
+        texts = [plain_number(text) for text in texts]
+    return [float(text) for text in texts]
+
+
 def format_stamp(stamp_ns: int) -> str:
     """Return a stamp in seconds with nine decimals, without loss.
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Set
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -231,12 +231,11 @@ class WholeGraph:
                 found.setdefault(min(a, b), index)
         return list(found.values())
 
-    def chained(self, trusted: Sequence[int]) -> dict[int, gtsam.Pose3]:
+    def chained(self, trusted: Set[int]) -> dict[int, gtsam.Pose3]:
         """Return the poses that are connected with a prior, along as few other links as can be."""
         neighbours: list[list[tuple[int, gtsam.Pose3, bool]]] = [[] for _ in self.frame_ids]
-        is_trusted = np.isin(np.arange(len(self.links)), trusted).tolist()
-        for (reference, frame, edge), is_first in zip(self.links, is_trusted, strict=True):
-            T = gtsam.Pose3(edge.T_reference_frame)
+        for index, (reference, frame, edge) in enumerate(self.links):
+            T, is_first = gtsam.Pose3(edge.T_reference_frame), index in trusted
             neighbours[reference].append((frame, T, is_first))
             neighbours[frame].append((reference, T.inverse(), is_first))
         queue = deque((key, gtsam.Pose3(p.T_world_frame)) for key, p in self.anchors().items())
@@ -407,11 +406,11 @@ class BatchOptimizer:
     ) -> None:
         self._on_step, self._is_graduated = on_step, robust == "gnc"
         self._make = Factors(WindowConfig(kernel="huber" if robust == "huber" else "none"))
-        trusted = graph.trusted()
+        trusted = set(graph.trusted())
         chained = graph.chained(trusted)
         self.numbers = sorted(chained)
         self._stamps_ns = np.array([graph.stamps_ns[n] for n in self.numbers], dtype=np.int64)
-        self._split(graph, set(trusted))
+        self._split(graph, trusted)
         self.raw, self.values = gtsam.Values(), gtsam.Values()
         for key in self.numbers:
             T = graph.given.get(graph.frame_ids[key])
@@ -422,7 +421,7 @@ class BatchOptimizer:
         self.starts: dict[str, float] = {}
         self._choose_start(is_given=bool(graph.given))
 
-    def _split(self, graph: WholeGraph, trusted: set[int]) -> None:
+    def _split(self, graph: WholeGraph, trusted: Set[int]) -> None:
         """Make the factors of the graph; those that may be refused apart from the others."""
         self._kept, self._doubted = gtsam.NonlinearFactorGraph(), list[Link]()
         for key, prior in graph.anchors().items():

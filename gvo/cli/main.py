@@ -14,7 +14,7 @@ import typer
 from typer import Argument, Option
 from typer.main import get_command
 
-from gvo._text import plain_number
+from gvo._text import plain_floats
 from gvo._version import __version__
 from gvo.cli import options as opt
 from gvo.cli.batch import batch
@@ -405,7 +405,7 @@ def config_(
 
 def _parse_lengths(text: str) -> list[float]:
     try:
-        lengths = [float(plain_number(part)) for part in text.split(",")]
+        lengths = plain_floats(text.split(","))
     except ValueError:
         lengths = []
     if not lengths or not all(0 < length < float("inf") for length in lengths):

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gvo._text import cut, exists, plain_number, text_lines
+from gvo._text import cut, exists, plain_floats, text_lines
 from gvo.errors import TrajectoryError, write_faults
 from gvo.geometry import se3
 from gvo.trajectory.trajectory import StampsFrom, Trajectory, format_stamp, parse_stamp
@@ -498,7 +498,7 @@ def read_table(
                 f"expected {n_columns} columns, got {len(row.fields)}; remove or complete the row"
             )
         try:
-            values.extend([float(plain_number(field)) for field in row.fields[columns]])
+            values.extend(plain_floats(row.fields[columns]))
             stamps_ns.append(parse_stamp(row.fields[0], unit_ns=unit_ns) if unit_ns else 0)
         except ValueError as error:
             raise row.error(f"{error}; expected {len(row.fields)} numbers") from None

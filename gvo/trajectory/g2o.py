@@ -25,13 +25,16 @@ from typing import TypeAlias
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gvo._text import plain_number
+from gvo._text import plain_floats, plain_number
 from gvo.geometry import se3
 from gvo.trajectory.formats import MAX_POSITION_M, from_upper_triangle, upper_triangle
 from gvo.types import FloatArray, FrameId, GraphEdge
 
 _UNIT_INFORMATION = list(map(repr, upper_triangle(np.eye(6)).tolist()))
 _SWAPPED = np.array([3, 4, 5, 0, 1, 2])
+# Which number of the upper triangle is an element of the matrix; with swapped axes.
+_ORDER = from_upper_triangle(np.arange(21.0)).astype(np.int64)
+_SWAPPED_ORDER = _ORDER[np.ix_(_SWAPPED, _SWAPPED)]
 _NORM_TOLERANCE = 1e-2
 _QUATERNION_TAGS = ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")
 _ANGLE_TAGS = ("VERTEX3", "EDGE3")
@@ -151,7 +154,7 @@ def _numbers(fields: list[str]) -> tuple[list[int], list[float]]:
     if len(fields) != n_expected:
         raise ValueError(f"{tag} needs {n_expected - 1} numbers, got {len(fields) - 1}")
     ids = [_id(field) for field in fields[1 : 1 + n_ids]]
-    return ids, [float(plain_number(field)) for field in fields[1 + n_ids :]]
+    return ids, plain_floats(fields[1 + n_ids :])
 
 
 def _lines_of(tag: str, rows: Sequence[tuple[int, list[int], list[float]]]) -> Iterator[Line]:
@@ -202,10 +205,7 @@ def transforms_of(numbers: FloatArray) -> FloatArray:
 
 def _covariances(upper: FloatArray, *, is_swapped: bool) -> FloatArray:
     """Return the inverses of information matrices, shape (n, 21) to (n, 6, 6)."""
-    order = np.asarray(from_upper_triangle(np.arange(21.0)), dtype=np.int64)
-    if is_swapped:
-        order = order[np.ix_(_SWAPPED, _SWAPPED)]
-    information = upper[:, order]
+    information = upper[:, _SWAPPED_ORDER if is_swapped else _ORDER]
     try:
         covariances = np.linalg.inv(information)
     except np.linalg.LinAlgError:
@@ -248,9 +248,8 @@ def convert_line(text: str) -> str:
     if not isinstance(line, Measurement):
         return text
     numbers = text.partition("#")[0].split()[9:] or _UNIT_INFORMATION
-    order = from_upper_triangle(np.arange(21.0))[np.ix_(_SWAPPED, _SWAPPED)]
     # The numbers as written, reordered: nothing is rounded.
-    upper = " ".join(numbers[int(i)] for i in upper_triangle(order))
+    upper = " ".join(numbers[int(i)] for i in upper_triangle(_SWAPPED_ORDER))
     T = line.T_reference_frame
     return f"EDGE_SE3:QUAT {line.reference_id} {line.frame_id} {_pose_fields(T)} {upper}"
 
