@@ -99,17 +99,20 @@ def plain_number(text: str) -> str:
     ValueError
         For digits of other scripts and underscores, which those take.
     """
-    if not text.isascii() or "_" in text:
+    if not _is_plain(text):
         raise ValueError(f"{shortened(text)} is no decimal number")
     return text
 
 
 def plain_floats(texts: Sequence[str]) -> list[float]:
     """Return many numbers; raises ValueError as `plain_number` and `float` do."""
-    joined = "".join(texts)
-    if not joined.isascii() or "_" in joined:
+    if not _is_plain("".join(texts)):
         texts = [plain_number(text) for text in texts]
     return [float(text) for text in texts]
+
+
+def _is_plain(text: str) -> bool:
+    return text.isascii() and "_" not in text
 
 
 def format_stamp(stamp_ns: int) -> str:

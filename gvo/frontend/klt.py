@@ -437,7 +437,7 @@ class KltFrontend:
         """Return the warps of patches by a motion; of stereo, slopes of disparities after it."""
         offset = np.array([0.0, 0.0, self.rig_offsets.disparity_px])
         uvd = reference.uvd[indices] - offset
-        slopes = reference.slopes[indices].astype(np.float64)
+        slopes = reference.slopes[indices].astype(np.float64, copy=False)
         T_current_reference = se3.invert(T_reference_current)
         warps = patch_warps(uvd, slopes, T_current_reference, self.camera)
         if not self._is_stereo:

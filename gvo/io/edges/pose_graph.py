@@ -109,35 +109,40 @@ class PoseGraphSource:
 
     def _scan(self) -> None:
         """Find what holds the world, and the tags that are not understood, in one quick pass."""
-        first: dict[str, tuple[int, str]] = {}
+        first_vertex: g2o.Vertex | None = None
+        first_edge: g2o.Measurement | None = None
         fixed_ids: list[int] = []
         for number, text in self._texts():
             tag = text.split(maxsplit=1)[0]
             if tag not in g2o.TAGS:
                 self._note_foreign(tag, number)
-            elif tag == "FIX":
+                continue
+            is_edge = tag in g2o.MEASUREMENT_TAGS
+            self._n_vertices += not is_edge and tag != "FIX"
+            if tag == "FIX" or (first_edge if is_edge else first_vertex) is None:
                 line = self._parsed(number, text)
                 fixed_ids += line.frame_ids if isinstance(line, g2o.Fix) else ()
-            else:
-                is_edge = tag in g2o.MEASUREMENT_TAGS
-                self._n_vertices += not is_edge
-                first.setdefault("edge" if is_edge else "vertex", (number, text))
-        if "edge" not in first:
+                first_edge = line if isinstance(line, g2o.Measurement) else first_edge
+                first_vertex = line if isinstance(line, g2o.Vertex) else first_vertex
+        if first_edge is None:
             foreign = "".join(f" ({warning})" for warning in self.faults.warnings())
             raise TrajectoryError(
                 f"{self._path}: holds no edge between poses in 3-D; expected lines of "
                 f"{' or '.join(g2o.MEASUREMENT_TAGS)}{foreign}"
             )
+        self._choose_anchor(fixed_ids, first_vertex, first_edge)
+
+    def _choose_anchor(
+        self, fixed_ids: list[int], first_vertex: g2o.Vertex | None, first_edge: g2o.Measurement
+    ) -> None:
         if fixed_ids:
             self._start_id = fixed_ids[0]
             self._fixed = self._vertices(set(fixed_ids))
-            return
-        line = self._parsed(*first.get("vertex", first["edge"]))
-        if isinstance(line, g2o.Vertex):
-            self._start_id = line.frame_id
-            self._fixed = {line.frame_id: line.T_world_frame}
-        elif isinstance(line, g2o.Measurement):
-            self._start_id = line.reference_id
+        elif first_vertex is not None:
+            self._start_id = first_vertex.frame_id
+            self._fixed = {first_vertex.frame_id: first_vertex.T_world_frame}
+        else:
+            self._start_id = first_edge.reference_id
 
     def _vertices(self, frame_ids: set[int]) -> dict[int, FloatArray]:
         lines = (line for line in self._lines() if isinstance(line, g2o.Vertex))

@@ -194,6 +194,14 @@ def test_gtsams_examples_are_connected(name: str) -> None:
         ([], "holds no edge"),
         (["EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1"], "EDGE_SE2"),
         (["EDGE_SE3:QUAT 0 1 1 2"], "graph.g2o:1: EDGE_SE3:QUAT needs 30 numbers"),
+        (
+            ["VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1", "EDGE_SE3:QUAT 0 1 1 2"],
+            "graph.g2o:2: EDGE_SE3:QUAT needs 30 numbers",
+        ),
+        (
+            ["FIX 0", "VERTEX_SE3:QUAT 0 0 0", edge_line(0, 1)],
+            "graph.g2o:2: VERTEX_SE3:QUAT needs 8 numbers",
+        ),
         (["<xml>"], "graph.g2o:1"),
     ],
 )
