@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,7 @@ from gvo.io.sync import Paired, StampFilter, pair_images
 from gvo.types import DepthArray, FaultyFrame, Frame, ImageArray, RgbdFrame, StereoFrame
 
 _ROW_STEP = 64
-# Colour takes longer to decode than depth: with one frame ahead the thread of the depth idles.
+# Frames that are decoded ahead: with one, the thread idles where tracking a frame takes long.
 _N_AHEAD = 2
 _MILLIMETRES = 1000.0
 # What reading or decoding one image may raise besides, in a source of one's own as well.
@@ -35,7 +35,7 @@ _Preparers: TypeAlias = tuple["ImagePreparer", "ImagePreparer"]
 Through: TypeAlias = Callable[[Iterator[Paired]], Iterator[Paired]]
 """What pairs go through before they are decoded."""
 _Prepared: TypeAlias = NDArray[Any] | str
-_Jobs: TypeAlias = Sequence[Callable[[], _Prepared]]
+_Jobs: TypeAlias = Sequence[tuple[Callable[[], _Prepared], Future[_Prepared] | None]]
 _Started: TypeAlias = tuple[Paired, _Jobs]
 
 
@@ -54,9 +54,8 @@ def frames(
     source : Source
         The recording.
     config : Config, optional
-        `sync` decides which images make one frame; with `runtime.threads` above one the images
-        of a frame are decoded side by side, two frames ahead. The result does not depend on the
-        number of threads.
+        `sync` decides which images make one frame; with `runtime.threads` above one they are
+        decoded two frames ahead. The result does not depend on the number of threads.
     excerpt : Excerpt, optional
         The part that is wanted; the whole where omitted.
     with_unpaired : bool
@@ -166,8 +165,9 @@ def pair_limit_key(sensor: Sensor) -> str:
 def _decoded(
     items: Iterator[Paired], preparers: _Preparers, info: RecordingInfo, threads: int, n_ahead: int
 ) -> Iterator[Frame | FaultyFrame]:
-    """Yield the frames of pairs, decoded side by side and ahead where there is a second thread."""
-    with ThreadPoolExecutor(max_workers=2, thread_name_prefix="decode") as pool:
+    """Yield the frames of pairs, decoded ahead where there are other threads."""
+    is_alone = threads == 1
+    with ThreadPoolExecutor(1 if threads <= 2 else 2, thread_name_prefix="decode") as pool:
         started: deque[_Started] = deque()
         fault: GvoError | None = None
         while fault is None:
@@ -180,10 +180,8 @@ def _decoded(
             else:
                 pair = () if isinstance(item, FaultyFrame) else zip(item, preparers, strict=True)
                 jobs = [partial(_prepare, *job, info) for job in pair]
-                is_alone = threads == 1
-                started.append(
-                    (item, jobs if is_alone else [pool.submit(job).result for job in jobs])
-                )
+                futures = [None if is_alone else pool.submit(job) for job in jobs]
+                started.append((item, list(zip(jobs, futures, strict=True))))
                 if len(started) > (0 if is_alone else n_ahead):
                     yield _finish(*started.popleft(), info.sensor)
         while started:
@@ -195,7 +193,9 @@ def _decoded(
 def _finish(item: Paired, jobs: _Jobs, sensor: Sensor) -> Frame | FaultyFrame:
     if isinstance(item, FaultyFrame):
         return item
-    first, second = (result() for result in jobs)
+    # What no other thread has begun is done on this one, which would wait.
+    done = [job() if future is None or future.cancel() else future for job, future in jobs]
+    first, second = (each.result() if isinstance(each, Future) else each for each in done)
     if isinstance(first, str) or isinstance(second, str):
         reasons = [each for each in (first, second) if isinstance(each, str)]
         return FaultyFrame(stamp_ns=item[0].stamp_ns, reason="; ".join(reasons))

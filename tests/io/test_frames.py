@@ -4,6 +4,7 @@ import json
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -230,6 +231,29 @@ def test_what_was_read_before_a_recording_breaks_is_delivered(tiny: Any, threads
     assert [next(iterator).stamp_ns for _ in range(3)] == [0, 1, 2]
     with pytest.raises(RecordingError, match="truncated"):
         next(iterator)
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_an_image_that_no_thread_has_begun_is_not_waited_for(tiny: Any, threads: int) -> None:
+    """The left image is decoded only after the right one: its thread, the second, waits for it."""
+    source = tiny.stereo([(s, 0, tiny.texture(s)) for s in (0, 1)])
+    whole, is_right_loaded, found = source.images, threading.Event(), []
+
+    def load_left(image: StampedImage) -> Any:
+        found.append(is_right_loaded.wait(60.0))
+        return image.load()
+
+    def load_right(image: StampedImage) -> Any:
+        is_right_loaded.set()
+        return image.load()
+
+    def holding() -> Iterator[StampedImage]:
+        for image in whole():
+            yield replace(image, load=partial((load_left, load_right)[image.stream], image))
+
+    source.images = holding
+    assert len(_read(source, threads)) == 1
+    assert found == [True]
 
 
 def test_reading_can_be_stopped(tiny: Any) -> None:
