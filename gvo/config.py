@@ -129,7 +129,9 @@ class KltConfig(Section):
     window_radius_px: int = _expert(
         4, "half size of the window that Lucas-Kanade begins with", "px", ge=2, le=50
     )
-    n_levels: int = _expert(2, "pyramid levels above the image, from a prediction", ge=0, le=8)
+    n_levels: int = _expert(
+        2, "pyramid levels above the image, from a prediction; the finest is aligned", ge=1, le=8
+    )
     n_wide_levels: int = _expert(
         4, "pyramid levels above the image without a prediction, or after it failed", ge=0, le=8
     )
@@ -326,8 +328,8 @@ class RuntimeConfig(Section):
 
     threads: int = _common(
         2,
-        "1: sequential; 2 and more: images decoded ahead, and left and right described side by "
-        "side (descriptor)",
+        "1: sequential; 2: images decoded ahead, left and right described side by side "
+        "(descriptor); 3 and more: two threads decode",
         ge=1,
         le=64,
     )

@@ -25,6 +25,7 @@ from gvo.frontend.tracking import (
     RADIUS_PX,
     Templates,
     detect_corners,
+    halve,
     move_slopes,
     patch_warps,
     track_pixels,
@@ -50,11 +51,8 @@ from gvo.types import (
 _MIN_DEPTH_M = 1e-3
 # Gauss-Newton steps from the predicted disparity of a track.
 _N_TRACK_STEPS = 4
-# Steps of the alignment of a patch, from its track and from its prediction. A track that moves
-# farther, in pixels, was of something else.
-_N_ALIGN_STEPS = 3
-_N_LINK_STEPS = 4
-_MAX_ALIGN_PX = 2.0
+# An alignment that ends farther from its track was of something else.
+_MAX_ALIGN_PX = 3.0
 # Share of the points in view that an alignment from the prediction has to confirm, times the share
 # of those that came to rest.
 _MIN_SHARE_ALIGNED = 0.1
@@ -67,9 +65,9 @@ _MIN_SHARE_TRACKED = 0.25
 _WIDE = 1.5
 # By how much more corners of a lost camera are looked for.
 _DENSITY = 3
-# How tracks are found: over more levels of the pyramid; near the predicted pixels, or without its
-# finest level; by alignment alone, where the prediction is that of poses that are known.
-_Search: TypeAlias = Literal["wide", "near", "rough", "aligned"]
+# How tracks are found: over more levels of the pyramid; near the predicted pixels, without its
+# finest one; by alignment alone, where the prediction is that of poses that are known.
+_Search: TypeAlias = Literal["wide", "near", "aligned"]
 
 
 class KltFrontend:
@@ -111,17 +109,20 @@ class KltFrontend:
         frame : StereoFrame or RgbdFrame
         """
         self.rig_offsets.advance()
-        return KltObservations(frame=frame, corners=self._find_corners(frame))
+        half = halve(image_of(frame))
+        corners = self._find_corners(frame, half, self._config.klt)
+        return KltObservations(frame=frame, half=half, corners=corners)
 
-    def _find_corners(self, frame: Frame, klt: KltConfig | None = None) -> KltCorners:
+    def _find_corners(self, frame: Frame, half: ImageArray, klt: KltConfig) -> KltCorners:
         offset_px, row_offset_px = self._offsets_px()
-        corners = detect_corners(image_of(frame), klt or self._config.klt)
+        corners = detect_corners(image_of(frame), klt, half=half)
         row_px = None
         if isinstance(frame, StereoFrame):
             config, images = self._config.stereo, (frame.left, frame.right)
             limit = float(self.camera.depth_to_disparity(config.min_depth_m))
+            halves = half, halve(frame.right)
             measured = measure_corners(
-                images, corners, config, max_disparity=limit, row_offset_px=row_offset_px
+                images, halves, corners, config, max_disparity=limit, row_offset_px=row_offset_px
             )
             disparities, slopes = measured.disparities, measured.slopes
             if measured.row_shift_px is not None:
@@ -225,7 +226,7 @@ class KltFrontend:
         chosen = slice(None, None, len(indices) // _N_SAMPLED + 1)
         start, indices = predicted[chosen, :2], indices[chosen]
         warps, _ = self._predict_patches(T_predicted, reference, indices)
-        _, is_tracked = self._find_tracks((reference, current), indices, start, warps, "rough")
+        _, is_tracked = self._find_tracks((reference, current), indices, start, warps, "near")
         return bool(np.count_nonzero(is_tracked) >= _MIN_SHARE_TRACKED * len(indices))
 
     def _register_widely(
@@ -265,7 +266,8 @@ class KltFrontend:
                 "min_distance_px": 2 * klt.min_distance_px // 3,
             }
         )
-        return self._describe(observations, self._find_corners(observations.frame, dense))
+        corners = self._find_corners(observations.frame, observations.half, dense)
+        return self._describe(observations, corners)
 
     def _describe(self, observations: KltObservations, corners: KltCorners) -> KltPlace:
         frame = observations.frame
@@ -460,19 +462,17 @@ class KltFrontend:
         """
         reference, current = frames
         if warps is not None and search == "aligned":
-            return self._align(frames, indices, start, warps, n_steps=_N_LINK_STEPS)
+            return self._align(frames, indices, start, warps)
         klt = self._config.klt
-        images = cast(KltObservations, reference).image, current.image  # a place is only aligned
-        pairs = images, reference.keypoints[indices], start
+        kept = cast(KltObservations, reference)  # a place is only aligned
+        places = reference.keypoints[indices], start
         if warps is None:
-            return track_pixels(*pairs, klt, n_levels=klt.n_wide_levels, is_checked=True)
-        if search == "rough":
-            pixels, is_tracked = track_roughly(*pairs, klt)
-        else:
-            pixels, is_tracked = track_pixels(*pairs, klt, n_levels=klt.n_levels, is_checked=False)
+            images, n_levels = (kept.image, current.image), klt.n_wide_levels
+            return track_pixels(images, *places, klt, n_levels=n_levels, is_checked=True)
+        pixels, is_tracked = track_roughly((kept.half, current.half), *places, klt)
         tracked = np.flatnonzero(is_tracked)
         chosen = indices[tracked], pixels[tracked], warps[tracked]
-        aligned, is_found = self._align(frames, *chosen, n_steps=_N_ALIGN_STEPS)
+        aligned, is_found = self._align(frames, *chosen)
         is_found &= np.hypot(*(aligned - pixels[tracked]).T) < _MAX_ALIGN_PX
         pixels[tracked], is_tracked[tracked] = aligned, is_found
         return pixels, is_tracked
@@ -483,11 +483,9 @@ class KltFrontend:
         indices: IntArray,
         start: FloatArray,
         warps: FloatArray,
-        *,
-        n_steps: int,
     ) -> tuple[FloatArray, BoolArray]:
         templates = frames[0].templates.take(indices)
-        pixels, is_found = templates.align(frames[1].image, start, warps, n_steps=n_steps)
+        pixels, is_found = templates.align(frames[1].image, start, warps)
         return pixels, is_found & self.camera.is_in_view(pixels)
 
     def _measure(
@@ -581,11 +579,14 @@ class KltObservations:
     Parameters
     ----------
     frame : StereoFrame or RgbdFrame
+    half : ndarray of uint8, shape (height // 2, width // 2)
+        The image to track in, of half the size.
     corners : KltCorners
         Its own, tracked when the next frame comes.
     """
 
     frame: Frame
+    half: ImageArray
     corners: KltCorners
 
     @property

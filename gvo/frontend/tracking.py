@@ -42,6 +42,10 @@ _NOISE = 1.0
 # the steepest slope that a surface has in the target.
 _MIN_DISTANCE = 0.05
 _MAX_SLOPE = 0.75
+# An alignment makes so many steps; as many again are made by patches that the last of them moved by
+# more than this.
+_N_STEPS = 2
+_MOVING_PX = 0.03
 # A step of the alignment moves a patch by at most so much; it is at rest below so much.
 _MAX_STEP_PX = 1.0
 _MAX_LAST_STEP_PX = 0.2
@@ -98,18 +102,15 @@ def track_pixels(
 
 
 def track_roughly(
-    images: tuple[ImageArray, ImageArray],
+    halves: tuple[ImageArray, ImageArray],
     pixels: FloatArray,
     start: FloatArray,
     config: KltConfig,
 ) -> tuple[FloatArray, BoolArray]:
-    """Track pixels from a good prediction, without the finest level; as `track_pixels`.
+    """Track pixels from a good prediction in images of half the size; as `track_pixels`.
 
     At a fraction of the cost it tells which patches are there, and where to align them from.
     """
-    if config.n_levels == 0:
-        return track_pixels(images, pixels, start, config, n_levels=0, is_checked=False)
-    halves = halve(images[0]), halve(images[1])
     # The centre of a pixel of the half image is between those of four.
     first, begin = (0.5 * each - 0.25 for each in (pixels, start))
     tracked, is_tracked = track_pixels(
@@ -141,7 +142,9 @@ def _follow(
     return np.asarray(tracked, dtype=np.float32), np.asarray(is_found[:, 0] > 0) & is_finite
 
 
-def detect_corners(image: ImageArray, config: KltConfig) -> FloatArray:
+def detect_corners(
+    image: ImageArray, config: KltConfig, *, half: ImageArray | None = None
+) -> FloatArray:
     """Detect the corners of an image, to two pixels.
 
     The score of a pixel is the smaller eigenvalue of its gradients' covariance. Each cell of
@@ -152,6 +155,8 @@ def detect_corners(image: ImageArray, config: KltConfig) -> FloatArray:
     image : ndarray of uint8, shape (height, width)
     config : KltConfig
         Number of corners, weakest score, distances.
+    half : ndarray of uint8, optional
+        The image halved, where it is at hand.
 
     Returns
     -------
@@ -161,7 +166,8 @@ def detect_corners(image: ImageArray, config: KltConfig) -> FloatArray:
     border = (config.window_radius_px + 1) // _REDUCTION + 1
     if min(image.shape) // _REDUCTION <= 2 * border:
         return np.zeros((0, 2))
-    pixels, responses = _local_maxima(halve(image), config.min_eigenvalue, border)
+    half = halve(image) if half is None else half
+    pixels, responses = _local_maxima(half, config.min_eigenvalue, border)
     best = _best_of_cells(pixels, responses, config.min_distance_px, width=image.shape[1])
     chosen = choose_spread(
         pixels[best],
@@ -335,7 +341,7 @@ class Templates:
         return Templates(self.values[chosen], self.gradients[chosen], self.inverses[chosen])
 
     def align(
-        self, image: ImageArray, start: FloatArray, warps: FloatArray, *, n_steps: int
+        self, image: ImageArray, start: FloatArray, warps: FloatArray
     ) -> tuple[FloatArray, BoolArray]:
         """Find the patches in another image, near the start.
 
@@ -346,8 +352,6 @@ class Templates:
             Pixels (u, v).
         warps : ndarray of float64, shape (n, 2, 2)
             See `patch_warps`.
-        n_steps : int
-            At least one.
 
         Returns
         -------
@@ -355,8 +359,22 @@ class Templates:
         is_found : ndarray of bool, shape (n,)
             False where the search does not come to rest, or what it finds is unlike the patch.
         """
-        pixels, warps = start.copy(), warps.astype(np.float32)
-        for _ in range(n_steps):
+        single = warps.astype(np.float32)
+        pixels, unlike, moves = self._step(image, start, single)
+        moving = np.flatnonzero(moves > _MOVING_PX)
+        if len(moving):
+            more = self.take(moving)._step(image, pixels[moving], single[moving])
+            pixels[moving], unlike[moving], moves[moving] = more
+        variances = np.einsum("ni,ni->n", self.values, self.values) / self.values.shape[1]
+        are_alike = unlike <= _MAX_UNLIKE * variances + _UNLIKE_NOISE
+        return pixels, are_alike & (moves < _MAX_LAST_STEP_PX)
+
+    def _step(
+        self, image: ImageArray, start: FloatArray, warps: NDArray[np.float32]
+    ) -> tuple[FloatArray, NDArray[np.float32], FloatArray]:
+        """Return pixels after some steps, how unlike the patches are there, and the last moves."""
+        pixels = start.copy()
+        for _ in range(_N_STEPS):
             # Its mean has no effect: that of the gradients is zero.
             differences = sample_warped(image, pixels, warps) - self.values
             slopes = np.einsum("nij,nj->ni", self.gradients, differences)
@@ -366,15 +384,14 @@ class Templates:
             pixels -= moves
         differences -= differences.mean(axis=1, keepdims=True)
         # What the last step explains of the difference is gone.
-        n_pixels = self.values.shape[1]
-        left = np.einsum("ni,ni->n", differences, differences)
-        left -= np.einsum("ni,ni->n", slopes, steps)
-        variances = np.einsum("ni,ni->n", self.values, self.values) / n_pixels
-        are_alike = left / n_pixels <= _MAX_UNLIKE * variances + _UNLIKE_NOISE
-        return pixels, are_alike & (np.hypot(*moves.T) < _MAX_LAST_STEP_PX)
+        unlike = np.einsum("ni,ni->n", differences, differences)
+        unlike -= np.einsum("ni,ni->n", slopes, steps)
+        return pixels, unlike / self.values.shape[1], np.hypot(*moves.T)
 
 
-def sample_warped(image: ImageArray, pixels: FloatArray, warps: FloatArray) -> NDArray[np.uint8]:
+def sample_warped(
+    image: ImageArray, pixels: FloatArray, warps: NDArray[np.float32]
+) -> NDArray[np.uint8]:
     """Return warped patches around pixels, shape (n, s * s), interpolated."""
     n = len(pixels)
     if n == 0:  # refused by OpenCV

@@ -14,7 +14,7 @@ from __future__ import annotations
 from math import atan2, hypot, isfinite, tan
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf
+from scipy.linalg.lapack import dgesdd, dpotrf
 
 from gvo.types import BoolArray, FloatArray
 
@@ -197,7 +197,10 @@ def adjoint(T: FloatArray) -> FloatArray:
 
 def nearest_rotation(M: FloatArray) -> FloatArray:
     """Return the rotations nearest to matrices (..., 3, 3) in the Frobenius norm."""
-    U, _, Vt = np.linalg.svd(M)
+    if M.ndim == 2:  # LAPACK called directly: numpy takes several times as long for one matrix
+        U, _, Vt, _ = dgesdd(M)
+    else:
+        U, _, Vt = np.linalg.svd(M)
     signs = np.ones((*M.shape[:-2], 3))
     signs[..., 2] = np.linalg.det(U @ Vt)
     return np.asarray((U * signs[..., np.newaxis, :]) @ Vt)

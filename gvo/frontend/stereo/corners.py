@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from gvo._trace import note
 from gvo.config import StereoConfig
 from gvo.frontend.stereo.disparity import MAX_STEP_PX, Strips, fit_slopes, have_room
-from gvo.frontend.stereo.matching import parabola_minimum
+from gvo.frontend.stereo.matching import parabola_vertex
 from gvo.frontend.stereo.patches import (
     Likeness,
     Patches,
     correlate_rows,
     cut_patches,
-    interpolate_strips,
+    sample_patches,
 )
 from gvo.frontend.tracking import halve
 from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
@@ -28,9 +28,8 @@ N_SEARCH_STEPS = 6
 # Number of patches that the row offset is measured with.
 _MIN_ROW_SHIFTS = 50
 _MAX_ROW_SHIFTS = 120
-# The coarse search: images are halved so often, patches have this radius there.
-_N_HALVINGS = 2
-_REDUCTION = 2**_N_HALVINGS
+# The coarse search: images are halved twice, patches have this radius there.
+_REDUCTION = 4
 _COARSE_RADIUS_PX = 2
 _MIN_CORRELATION = 0.7
 # Steps on either side that belong to the same peak of correlation; and how much lower a second
@@ -69,6 +68,7 @@ class CornerDisparities:
 
 def measure_corners(
     images: tuple[ImageArray, ImageArray],
+    halves: tuple[ImageArray, ImageArray],
     corners: FloatArray,
     config: StereoConfig,
     *,
@@ -86,6 +86,8 @@ def measure_corners(
     ----------
     images : tuple of two ndarrays of uint8, shape (height, width)
         Rectified left and right.
+    halves : tuple of two ndarrays of uint8, shape (height // 2, width // 2)
+        The same of half the size.
     corners : ndarray of float64, shape (n, 2)
         Whole pixels in the left image.
     config : StereoConfig
@@ -99,7 +101,7 @@ def measure_corners(
     -------
     CornerDisparities
     """
-    rough, is_found, rivals = search_disparities(images, corners, max_disparity)
+    rough, is_found, rivals = search_disparities(halves, corners, max_disparity)
     shape, radius = images[0].shape, config.patch_radius_px
     placed = np.flatnonzero(is_found & have_room(shape, corners, rough, radius))
     have_rival = [have_room(shape, corners[placed], column, radius) for column in rivals[placed].T]
@@ -171,8 +173,9 @@ def _search_strips(
     else:
         patches = Patches.of(left[:, 1:-1]).take(owners)
         places, is_at_rest = strips.follow(patches, n_steps=N_SEARCH_STEPS)
-    right = interpolate_strips(strips.values, places, 2 * radius + 1)
-    return strips.disparities(places), right, is_at_rest
+    disparities = strips.disparities(places)
+    right = sample_patches(right_image, u - disparities, v + row_offset_px, radius, radius)
+    return disparities, right, is_at_rest
 
 
 def measure_row_shift(
@@ -198,8 +201,9 @@ def measure_row_shift(
         return None
     chosen = chosen[:: -(-len(chosen) // _MAX_ROW_SHIFTS)]
     # Transposed, a step along the rows becomes one across them.
-    tall = np.swapaxes(left[chosen, :, 1:-1], 1, 2)
-    steps = -Patches.of(tall).curve(np.swapaxes(right[chosen], 1, 2))[:, 0]
+    patches = Patches.of(np.swapaxes(left[chosen, :, 1:-1], 1, 2))
+    across = np.swapaxes(right[chosen], 1, 2)
+    steps = patches.at_rest - np.einsum("nij,nij->n", patches.weights, across)
     steps = steps[np.abs(steps) < MAX_STEP_PX]
     return float(np.median(steps)) if len(steps) >= _MIN_ROW_SHIFTS else None
 
@@ -212,16 +216,16 @@ def _scatter(flags: BoolArray, places: IntArray, n: int) -> BoolArray:
 
 
 def search_disparities(
-    images: tuple[ImageArray, ImageArray], pixels: FloatArray, max_disparity: float
+    halves: tuple[ImageArray, ImageArray], pixels: FloatArray, max_disparity: float
 ) -> tuple[FloatArray, BoolArray, FloatArray]:
     """Find the disparities of pixels to a few pixels, by normalized cross-correlation.
 
     Parameters
     ----------
-    images : tuple of two ndarrays of uint8, shape (height, width)
-        Rectified left and right.
+    halves : tuple of two ndarrays of uint8, shape (height // 2, width // 2)
+        Rectified left and right, of half the size.
     pixels : ndarray of float64, shape (n, 2)
-        Whole pixels in the left image.
+        Whole pixels in the full left image.
     max_disparity : float
         Pixels.
 
@@ -233,7 +237,7 @@ def search_disparities(
     rivals : ndarray of float64, shape (n, 3)
         Other disparities that correlate nearly as well, the best one first, else NaN.
     """
-    left, right = (_reduce(image) for image in images)
+    left, right = (halve(half).astype(np.float32) for half in halves)
     n_steps = min(int(np.ceil(max_disparity / _REDUCTION)), left.shape[1])
     columns, rows = (pixels // _REDUCTION).astype(np.int64).T
     columns = np.minimum(columns, left.shape[1] - 1)
@@ -243,35 +247,31 @@ def search_disparities(
     correlations[disparities > columns[:, np.newaxis]] = -1.0  # left of the right image
     best = np.argmax(correlations, axis=1)
     is_found = correlations[np.arange(len(best)), best] > _MIN_CORRELATION
-    between, is_between = parabola_minimum(-correlations)
+    between, is_between = parabola_vertex(correlations, best)
     steps = n_steps - np.where(is_between, between, best)
     rivals = _find_rivals(correlations, best, n_steps)
     return float(_REDUCTION) * steps, is_found, float(_REDUCTION) * rivals
 
 
 def _find_rivals(correlations: NDArray[np.float32], best: IntArray, n_steps: int) -> FloatArray:
-    """Return the next peaks, in steps, where they are nearly as good as the best, else NaN."""
+    """Return the next peaks, in steps, where they are nearly as good as the best, else NaN.
+
+    The peaks are taken out of the correlations.
+    """
     around = np.arange(-_PEAK_STEPS, _PEAK_STEPS + 1)
-    rows, elsewhere, peaks = np.arange(len(best)), correlations.copy(), best
+    rows, elsewhere, peaks = np.arange(len(best)), correlations, best
     least = correlations[rows, best] - _MAX_GAP
     rivals = np.full((len(best), _N_RIVALS), np.nan)
     for rank in range(_N_RIVALS):
-        near = np.clip(peaks[:, np.newaxis] + around, 0, n_steps)
-        np.put_along_axis(elsewhere, near, -1.0, axis=1)
+        near = np.minimum(np.maximum(peaks[:, np.newaxis] + around, 0), n_steps)
+        elsewhere[np.arange(len(peaks))[:, np.newaxis], near] = -1.0
         peaks = np.argmax(elsewhere, axis=1)
         # Where one is too low, so are the next.
         high = np.flatnonzero(elsewhere[np.arange(len(peaks)), peaks] > least[rows])
         rows, elsewhere, peaks = rows[high], elsewhere[high], peaks[high]
-        between, is_between = parabola_minimum(-elsewhere)
+        between, is_between = parabola_vertex(elsewhere, peaks)
         rivals[rows, rank] = n_steps - np.where(is_between, between, peaks)
     return rivals
-
-
-def _reduce(image: ImageArray) -> NDArray[np.float32]:
-    # Halved twice: a tenth of the time of a reduction by four.
-    for _ in range(_N_HALVINGS):
-        image = halve(image)
-    return image.astype(np.float32)
 
 
 def _correlate(
@@ -284,14 +284,15 @@ def _correlate(
     radius = _COARSE_RADIUS_PX
     size = 2 * radius + 1
     padded = _padded(left, radius, radius)
-    patches = sliding_window_view(padded, (size, size))[pixels]
-    patches = patches - patches.mean(axis=(1, 2), keepdims=True)
-    energy = np.maximum(np.sum(patches**2, axis=(1, 2)), _MIN_ENERGY)
+    patches = sliding_window_view(padded, (size, size))[pixels].reshape(-1, size**2)
+    patches -= patches.mean(axis=1, keepdims=True)
+    energies = np.einsum("ni,ni->n", patches, patches)[:, np.newaxis]
+    patches /= np.sqrt(np.maximum(energies, np.float32(_MIN_ENERGY)))
     padded = _padded(right, radius, radius + n_steps)
     strips = sliding_window_view(padded, (size, size + n_steps))[pixels]
-    products = correlate_rows(patches, strips)
-    energies = sliding_window_view(_energies(padded), n_steps + 1, axis=1)[pixels]
-    return np.asarray(products / np.sqrt(energies * energy[:, np.newaxis]))
+    products = correlate_rows(patches.reshape(-1, size, size), strips)
+    products /= sliding_window_view(_deviations(padded), n_steps + 1, axis=1)[pixels]
+    return products
 
 
 def _padded(image: NDArray[np.float32], radius: int, margin_left: int) -> NDArray[np.float32]:
@@ -299,12 +300,13 @@ def _padded(image: NDArray[np.float32], radius: int, margin_left: int) -> NDArra
     return np.asarray(cv2.copyMakeBorder(image, *margins, cv2.BORDER_REPLICATE), dtype=np.float32)
 
 
-def _energies(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the squared deviations from their mean of all patches that lie in the image."""
+def _deviations(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the norms of all patches that lie in the image, less their means."""
     radius = _COARSE_RADIUS_PX
     size = (2 * radius + 1, 2 * radius + 1)
     centred = image - np.float32(image.mean())  # or the difference loses its digits
     sums = cv2.boxFilter(centred, -1, size, normalize=False)
     squares = cv2.boxFilter(centred**2, -1, size, normalize=False)
     energies = squares - sums**2 / np.float32(size[0] * size[1])
-    return np.maximum(energies[radius:-radius, radius:-radius], np.float32(_MIN_ENERGY))
+    inside = energies[radius:-radius, radius:-radius]
+    return np.asarray(np.sqrt(np.maximum(inside, np.float32(_MIN_ENERGY))))

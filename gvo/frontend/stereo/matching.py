@@ -170,13 +170,17 @@ def parabola_minimum(values: NDArray[np.float32]) -> tuple[FloatArray, BoolArray
     is_minimum : ndarray of bool, shape (n,)
         False where the smallest sample is the first or last.
     """
+    return parabola_vertex(values, np.argmin(values, axis=1))
+
+
+def parabola_vertex(values: NDArray[np.float32], best: IntArray) -> tuple[FloatArray, BoolArray]:
+    """As `parabola_minimum`, of curves whose smallest or largest samples (n,) are known."""
     n, m = values.shape
-    best = np.argmin(values, axis=1)
-    is_minimum = (best > 0) & (best < m - 1)
-    inner = np.clip(best, 1, m - 2)
-    index = np.arange(n)
-    before, at, after = (values[index, inner + step].astype(np.float64) for step in (-1, 0, 1))
+    inner = np.minimum(np.maximum(best, 1), m - 2)
+    places = m * np.arange(n) + inner
+    samples = values.ravel()[np.stack([places - 1, places, places + 1])]
+    before, at, after = samples.astype(np.float64)
     curvature = before - 2.0 * at + after
-    is_minimum &= curvature > 0
-    shift = 0.5 * (before - after) / np.where(curvature > 0, curvature, 1.0)
-    return inner + shift, is_minimum
+    is_between = (best > 0) & (best < m - 1) & (curvature != 0.0)
+    shift = 0.5 * (before - after) / np.where(is_between, curvature, 1.0)
+    return inner + shift, is_between

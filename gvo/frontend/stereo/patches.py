@@ -108,12 +108,13 @@ class Patches:
     @classmethod
     def of(cls, wide: NDArray[np.float32]) -> Patches:
         """Prepare patches (n, s, s + 2), which are one column wider on either side."""
-        gradients = 0.5 * (wide[:, :, 2:] - wide[:, :, :-2])
-        gradients -= gradients.mean(axis=(1, 2), keepdims=True)
-        energies = np.einsum("nij,nij->n", gradients, gradients)
-        gradients /= np.maximum(energies, np.float32(_MIN_ENERGY))[:, np.newaxis, np.newaxis]
-        at_rest = np.einsum("nij,nij->n", gradients, wide[:, :, 1:-1])
-        return cls(weights=gradients, at_rest=at_rest)
+        n, height, width = len(wide), wide.shape[1], wide.shape[2] - 2
+        gradients = (0.5 * (wide[:, :, 2:] - wide[:, :, :-2])).reshape(n, height * width)
+        gradients -= gradients.mean(axis=1, keepdims=True)
+        energies = np.einsum("ni,ni->n", gradients, gradients)[:, np.newaxis]
+        gradients /= np.maximum(energies, np.float32(_MIN_ENERGY))
+        weights = gradients.reshape(n, height, width)
+        return cls(weights=weights, at_rest=np.einsum("nij,nij->n", weights, wide[:, :, 1:-1]))
 
     def take(self, chosen: IntArray) -> Patches:
         """Select patches by index, with repetitions."""
@@ -221,30 +222,6 @@ def correlate_rows(
     for column in range(1, size):
         sums += products[:, column, column : column + n_places]
     return sums
-
-
-def interpolate_strips(
-    strips: NDArray[np.float32], places: FloatArray, size: int
-) -> NDArray[np.float32]:
-    """Return the patches at places in strips.
-
-    Parameters
-    ----------
-    strips : ndarray of float32, shape (n, size, m)
-    places : ndarray of float64, shape (n,)
-        Column of the strip where each patch begins, from 0 to m - size.
-    size : int
-        Side of the patches.
-
-    Returns
-    -------
-    ndarray of float32, shape (n, size, size)
-    """
-    whole = np.minimum(places.astype(np.int64), strips.shape[2] - size - 1)
-    fractions = (places - whole).astype(np.float32)[:, np.newaxis, np.newaxis]
-    wide = sliding_window_view(strips, size + 1, axis=2)[np.arange(len(strips)), :, whole]
-    before, after = wide[:, :, :-1], wide[:, :, 1:]
-    return np.asarray(before + fractions * (after - before))
 
 
 def squared_differences(

@@ -13,6 +13,7 @@ from gvo.frontend.stereo.corners import (
     measure_corners,
     search_disparities,
 )
+from gvo.frontend.tracking import halve
 from gvo.types import FloatArray, ImageArray
 from tests.frontend.analytic import SHAPE, grid, image, slanted_pair
 
@@ -27,7 +28,13 @@ def measure(
     config: StereoConfig = CONFIG,
 ) -> CornerDisparities:
     chosen = grid() if corners is None else corners
-    return measure_corners(images, chosen, config, max_disparity=40.0, row_offset_px=row_offset_px)
+    return measure_corners(
+        images, halved(images), chosen, config, max_disparity=40.0, row_offset_px=row_offset_px
+    )
+
+
+def halved(images: tuple[ImageArray, ImageArray]) -> tuple[ImageArray, ImageArray]:
+    return halve(images[0]), halve(images[1])
 
 
 @settings(max_examples=15)
@@ -114,12 +121,13 @@ def test_a_copy_is_found_behind_what_only_resembles_it() -> None:
         right[:, column : column + 25] = np.clip(seen + speckles, 0, 255)
     assert measure((left, right), corners).are_reliable.mean() > 0.7
     right[:, 138:163] = seen
-    rough, _, rivals = search_disparities((left, right), corners, 160.0)
+    halves = halved((left, right))
+    rough, _, rivals = search_disparities(halves, corners, 160.0)
     copied = np.abs(rivals - 34.0) < COARSE_ERROR_PX
     assert np.all(np.abs(rough - 8.0) < COARSE_ERROR_PX)
     assert copied[:, 1:].any()
     assert copied.any(axis=1).all()
-    found = measure_corners((left, right), corners, CONFIG, max_disparity=160.0)
+    found = measure_corners((left, right), halves, corners, CONFIG, max_disparity=160.0)
     assert not found.are_reliable.any()
 
 
@@ -156,30 +164,30 @@ def pair(disparity: FloatArray | float) -> tuple[ImageArray, ImageArray]:
 def test_the_coarse_search_finds_any_disparity_to_a_few_pixels(disparity: float) -> None:
     pixels = grid(border=12)
     pixels = pixels[pixels[:, 0] > disparity + 14]
-    found, is_found, _ = search_disparities(pair(disparity), pixels, 70.0)
+    found, is_found, _ = search_disparities(halved(pair(disparity)), pixels, 70.0)
     assert is_found.mean() > 0.9
     is_near = np.abs(found - disparity) <= COARSE_ERROR_PX
     assert is_near[is_found].mean() > 0.9
 
 
 def test_the_coarse_search_does_not_leave_the_image() -> None:
-    found, _, _ = search_disparities(pair(20.0), grid(border=0), 1000.0)
+    found, _, _ = search_disparities(halved(pair(20.0)), grid(border=0), 1000.0)
     assert np.all(found <= grid(border=0)[:, 0] + COARSE_ERROR_PX)
     assert np.all(found >= 0)
 
 
 def test_flat_images_hold_no_disparities() -> None:
     flat = np.full(SHAPE, 90, dtype=np.uint8)
-    _, is_found, _ = search_disparities((flat, flat), grid(), 50.0)
+    _, is_found, _ = search_disparities(halved((flat, flat)), grid(), 50.0)
     assert not is_found.any()
 
 
 @pytest.mark.parametrize("shape", [(3, 3), (8, 200), (200, 8)])
 def test_images_smaller_than_a_patch_give_nothing(shape: tuple[int, int]) -> None:
     tiny = np.zeros(shape, dtype=np.uint8)
-    assert not search_disparities((tiny, tiny), np.array([[1.0, 1.0]]), 50.0)[1].any()
+    assert not search_disparities(halved((tiny, tiny)), np.array([[1.0, 1.0]]), 50.0)[1].any()
 
 
 def test_no_pixels_give_no_disparities() -> None:
-    found, is_found, _ = search_disparities(pair(3.0), np.zeros((0, 2)), 50.0)
+    found, is_found, _ = search_disparities(halved(pair(3.0)), np.zeros((0, 2)), 50.0)
     assert found.shape == is_found.shape == (0,)

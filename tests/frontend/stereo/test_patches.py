@@ -2,13 +2,11 @@
 
 import cv2
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from gvo.frontend.stereo.patches import (
     Likeness,
     correlate_rows,
-    interpolate_strips,
     sample_patches,
     squared_differences,
 )
@@ -44,19 +42,6 @@ def test_between_pixels_a_patch_is_interpolated() -> None:
     (patch,) = sample_patches(whole, np.array([40.25]), np.array([30.5]), 3, 2)
     expected = cv2.getRectSubPix(whole, (7, 5), (40.25, 30.5), patchType=cv2.CV_32F)
     np.testing.assert_allclose(patch, expected, atol=1.0)  # rounded to grey values
-
-
-@pytest.mark.parametrize("place", [0.0, 0.3, 2.0, 3.75, 4.0])
-def test_patches_in_strips_are_those_of_the_image_there(place: float) -> None:
-    u, v = np.array([60.0, 81.0]), np.array([50.0, 33.0])
-    strips = sample_patches(image(), u, v, 5, 3)  # seven rows, eleven columns, five places
-    before, after = (
-        sample_patches(image(), u - 2.0 + whole, v, 3, 3)
-        for whole in (np.floor(place), np.ceil(place))
-    )
-    found = interpolate_strips(strips, np.array([place, place]), 7)
-    expected = before + (place - np.floor(place)) * (after - before)
-    np.testing.assert_allclose(found, expected, atol=1e-3)
 
 
 def test_patches_are_alike_at_the_right_disparity_whatever_the_exposure() -> None:
