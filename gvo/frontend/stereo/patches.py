@@ -120,32 +120,18 @@ class Patches:
         """Select patches by index, with repetitions."""
         return Patches(self.weights[chosen], self.at_rest[chosen])
 
-    def curve(self, strips: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the disparity steps at all places in strips of the right image.
-
-        Parameters
-        ----------
-        strips : ndarray of float32, shape (n, s, m)
-
-        Returns
-        -------
-        ndarray of float32, shape (n, m - s + 1)
-            Linear between the places, as the patches are.
-        """
-        products = correlate_rows(self.weights, strips)
-        products -= self.at_rest[:, np.newaxis]
-        return products
-
     def descend(
         self, strips: NDArray[np.float32], places: FloatArray, *, n_steps: int, max_step: float
     ) -> tuple[FloatArray, FloatArray]:
         """Return the places in strips (n, s, m) after some steps, and the last steps.
 
-        A step is a growth of the disparity; places are clipped to the strips.
+        A step is a growth of the disparity; places are clipped to the strips. Between whole places
+        steps are linear, as the patches are.
         """
-        curve = self.curve(strips)
-        n, n_places = curve.shape
-        firsts, flat = n_places * np.arange(n), curve.ravel()
+        steps = correlate_rows(self.weights, strips)
+        steps -= self.at_rest[:, np.newaxis]
+        n, n_places = steps.shape
+        firsts, flat = n_places * np.arange(n), steps.ravel()
         step = np.zeros(n)
         places = np.minimum(np.maximum(places, 0.0), n_places - 1.0)
         for _ in range(n_steps):
