@@ -360,16 +360,16 @@ class Templates:
             False where the search does not come to rest, or what it finds is unlike the patch.
         """
         single = warps.astype(np.float32)
-        pixels, unlike, moves = self._step(image, start, single)
+        pixels, unlike, moves = self._steps(image, start, single)
         moving = np.flatnonzero(moves > _MOVING_PX)
         if len(moving):
-            more = self.take(moving)._step(image, pixels[moving], single[moving])
+            more = self.take(moving)._steps(image, pixels[moving], single[moving])
             pixels[moving], unlike[moving], moves[moving] = more
         variances = np.einsum("ni,ni->n", self.values, self.values) / self.values.shape[1]
         are_alike = unlike <= _MAX_UNLIKE * variances + _UNLIKE_NOISE
         return pixels, are_alike & (moves < _MAX_LAST_STEP_PX)
 
-    def _step(
+    def _steps(
         self, image: ImageArray, start: FloatArray, warps: NDArray[np.float32]
     ) -> tuple[FloatArray, NDArray[np.float32], FloatArray]:
         """Return pixels after some steps, how unlike the patches are there, and the last moves."""

@@ -96,7 +96,7 @@ TOLD = {
     "depth-in-colour": "got float32 (192, 256, 3)",
     "exchanged": "are left and right exchanged",
     "mirrored": "are left and right exchanged",
-    "right-lower": "regist",  # of no frame, or of few
+    "right-lower": "no frame could be registered",
     "depth-in-mm": "depth.scale wrong",
     "depth-in-km": "depth.scale wrong",
     "depth-holes": "no frame could be registered",
