@@ -184,7 +184,7 @@ class KltFrontend:
         if prior.T_recent is None:
             result = self._register_keyframe(prior, reference, current)
         else:
-            result = self._register_from(prior, reference, current, "near", is_step=True)
+            result = self._register_step(prior, reference, current, "near")
             if not isinstance(result, RelativePose | Contradiction):
                 return self._register_widely(reference, current, prior)
         if prior.is_confirmed:
@@ -200,47 +200,44 @@ class KltFrontend:
         off: then few come to rest, or they disagree. But the view may as well have changed: then
         a sample of tracks is not found either.
         """
-        aligned = self._register_from(prior, reference, current, "aligned", is_step=False)
+        frames = reference, current
+        expected = self._predict(prior.T_predicted, *frames)
+        aligned = self._register_link(prior, self._track(*frames, expected, "aligned"))
         if isinstance(aligned, Contradiction):
             return aligned
         if isinstance(aligned, RelativePose):
             n_confirmed = aligned.n_inliers**2 / (_MIN_SHARE_ALIGNED * aligned.n_matches)
-            if n_confirmed >= len(reference):
+            if n_confirmed >= len(expected.indices):
                 return aligned
-            _, in_view = self._predict(prior.T_predicted, reference, current)
-            if n_confirmed >= len(in_view):
-                return aligned
-        if not self._is_seen_again(prior.T_predicted, reference, current):
+        if not self._is_seen_again(*frames, expected):
             return aligned
-        tracked = self._register_from(prior, reference, current, "near", is_step=False)
+        tracked = self._register_link(prior, self._track(*frames, expected, "near"))
         if isinstance(aligned, Failure):
             return tracked
         is_more = isinstance(tracked, RelativePose) and tracked.n_inliers > aligned.n_inliers
         return tracked if is_more else aligned
 
     def _is_seen_again(
-        self, T_predicted: FloatArray, reference: KltObservations, current: KltObservations
+        self, reference: KltObservations, current: KltObservations, expected: _Expected
     ) -> bool:
         """Tell whether enough of a sample of the points in view are tracked."""
-        predicted, indices = self._predict(T_predicted, reference, current)
-        chosen = slice(None, None, len(indices) // _N_SAMPLED + 1)
-        start, indices = predicted[chosen, :2], indices[chosen]
-        warps, _ = self._predict_patches(T_predicted, reference, indices)
-        _, is_tracked = self._find_tracks((reference, current), indices, start, warps, "near")
-        return bool(np.count_nonzero(is_tracked) >= _MIN_SHARE_TRACKED * len(indices))
+        n = len(expected.indices)
+        sample = expected.take(np.arange(0, n, n // _N_SAMPLED + 1))
+        _, is_tracked = self._find_tracks(reference, current, sample, "near")
+        return bool(np.count_nonzero(is_tracked) >= _MIN_SHARE_TRACKED * len(is_tracked))
 
     def _register_widely(
         self, reference: KltObservations, current: KltObservations, prior: MotionPrior | None
     ) -> RelativePose | Failure:
         """Register in two rounds: over more levels of the pyramid, and from the result."""
-        rough = self._register_from(prior, reference, current, "wide", is_step=True)
+        rough = self._register_step(prior, reference, current, "wide")
         if prior is None and not isinstance(rough, RelativePose | Contradiction):
             places = self.describe(reference), self.describe(current)
             rough = self._register_places(*places) or rough
         if isinstance(rough, Failure):
             return rough
         found = MotionPrior(T_predicted=rough.T_reference_current)
-        result = self._register_from(found, reference, current, "near", is_step=True)
+        result = self._register_step(found, reference, current, "near")
         # Nothing predicted it: what else it predicts must be there too.
         return check_view(result, reference.points_cam, self.camera)
 
@@ -308,7 +305,10 @@ class KltFrontend:
         if isinstance(rough, Failure):
             return rough
         prior = MotionPrior(T_predicted=rough.T_reference_current)
-        result = self._register_from(prior, reference, observations, "aligned", is_step=False)
+        expected = self._predict(prior.T_predicted, reference, observations)
+        result = self._register_link(
+            prior, self._track(reference, observations, expected, "aligned")
+        )
         checked = check_view(result, reference.points_cam, self.camera)
         points, frame = reference.depth_points, observations.frame
         if isinstance(result, Failure) or points is None or not isinstance(frame, RgbdFrame):
@@ -348,33 +348,27 @@ class KltFrontend:
             return check_depths(result, points, second.depth, self.camera, self._config.depth)
         return result
 
-    def _register_from(
+    def _register_step(
         self,
         prior: MotionPrior | None,
-        reference: _Reference,
+        reference: KltObservations,
         current: KltObservations,
         search: _Search,
-        *,
-        is_step: bool,
     ) -> RelativePose | Failure:
         """Track from the pixels that a motion predicts, measure in 3-D, register."""
         T_predicted = None if prior is None else prior.T_predicted
-        if is_step:
-            self.rig_offsets.velocities.expect(reference, current, T_predicted)
+        self.rig_offsets.velocities.expect(reference, current, T_predicted)
         T = np.eye(4) if T_predicted is None else T_predicted
-        source_uvd, target_uvd, indices = self._track(T, reference, current, search)
+        expected = self._predict(T, reference, current)
         return self._calibrated.register(
-            Measurements(
-                frames=(reference, current),
-                uvd=(source_uvd, target_uvd),
-                sigmas=self._sigmas(len(indices)),
-                matches=np.column_stack([indices, np.full_like(indices, -1)]),
-                sigma_factor=self._config.klt.sigma_factor,
-            ),
+            self._track(reference, current, expected, search),
             self._config,
             prior=None if search == "wide" else prior,
-            is_step=is_step,
+            is_step=True,
         )
+
+    def _register_link(self, prior: MotionPrior, measured: Measurements) -> RelativePose | Failure:
+        return self._calibrated.register(measured, self._config, prior=prior, is_step=False)
 
     def _sigmas(self, n: int) -> tuple[FloatArray, FloatArray]:
         """Return the sigmas of (u, v, disparity) of corners and of their tracks."""
@@ -387,129 +381,121 @@ class KltFrontend:
 
     def _track(
         self,
-        T_reference_current: FloatArray,
         reference: _Reference,
         current: KltObservations,
+        expected: _Expected,
         search: _Search,
-    ) -> tuple[FloatArray, FloatArray, IntArray]:
-        """Return (u, v, disparity) of corners, of their tracks, and which corners these are."""
-        source_uvd = reference.uvd
-        predicted, indices = self._predict(T_reference_current, reference, current)
-        warps = slopes = None
-        if search != "wide":
-            warps, slopes = self._predict_patches(T_reference_current, reference, indices)
-        pixels, is_tracked = self._find_tracks(
-            (reference, current), indices, predicted[:, :2], warps, search
-        )
+    ) -> Measurements:
+        """Find expected corners in the current frame, and measure them there."""
+        pixels, is_tracked = self._find_tracks(reference, current, expected, search)
         note(
             "attempt",
             method="tracks",
-            prior=T_reference_current,
+            prior=expected.T_reference_current,
             is_wide=search == "wide",
             radius_px=float(self._config.klt.window_radius_px),
-            source_uvd=source_uvd,
-            indices=indices,
-            predicted=predicted,
+            source_uvd=reference.uvd,
+            indices=expected.indices,
+            predicted=expected.uvd,
             pixels=pixels,
             is_tracked=is_tracked,
         )
-        pixels, predicted, indices = pixels[is_tracked], predicted[is_tracked], indices[is_tracked]
-        disparities, is_valid = self._measure(
-            current.frame, pixels, predicted[:, 2], None if slopes is None else slopes[is_tracked]
-        )
+        tracked = np.flatnonzero(is_tracked)
+        pixels, expected = pixels.take(tracked, axis=0), expected.take(tracked)
+        disparities, is_valid = self._measure(current.frame, pixels, expected, search)
         note("klt.measured", pixels=pixels, disparities=disparities, is_valid=is_valid)
-        target_uvd = np.column_stack([pixels, disparities])[is_valid]
-        return source_uvd[indices[is_valid]], target_uvd, indices[is_valid]
+        valid = np.flatnonzero(is_valid)
+        indices = expected.indices.take(valid)
+        target_uvd = np.column_stack([pixels, disparities]).take(valid, axis=0)
+        return Measurements(
+            frames=(reference, current),
+            uvd=(reference.uvd.take(indices, axis=0), target_uvd),
+            sigmas=self._sigmas(len(indices)),
+            matches=np.column_stack([indices, np.full_like(indices, -1)]),
+            sigma_factor=self._config.klt.sigma_factor,
+        )
 
     def _predict(
         self, T_reference_current: FloatArray, reference: _Reference, current: KltObservations
-    ) -> tuple[FloatArray, IntArray]:
-        """Return (u, v, disparity), as measured, of the points in view of the current camera."""
-        uvd = self._calibrated.correct(reference, reference.uvd)
-        points = self.camera.unproject_stereo(uvd[:, :2], uvd[:, 2])
-        points = se3.transform_points(se3.invert(T_reference_current), points)
+    ) -> _Expected:
+        """Return the corners that are in view of the current camera after a motion."""
+        settled = self._calibrated.correct(reference, reference.uvd)
+        points = self.camera.unproject_stereo(settled[:, :2], settled[:, 2])
+        T_current_reference = se3.invert(T_reference_current)
+        points = se3.transform_points(T_current_reference, points)
         in_front = np.flatnonzero(points[:, 2] > _MIN_DEPTH_M)
         seen = self._calibrated.distort(current, self.camera.project_stereo(points[in_front]))
-        is_in_view = self.camera.is_in_view(seen[:, :2])
-        return seen[is_in_view], in_front[is_in_view]
-
-    def _predict_patches(
-        self, T_reference_current: FloatArray, reference: _Reference, indices: IntArray
-    ) -> tuple[FloatArray, FloatArray | None]:
-        """Return the warps of patches by a motion; of stereo, slopes of disparities after it."""
+        in_view = np.flatnonzero(self.camera.is_in_view(seen[:, :2]))
+        indices = in_front.take(in_view)
         offset = np.array([0.0, 0.0, self.rig_offsets.disparity_px])
-        uvd = reference.uvd[indices] - offset
-        slopes = reference.slopes[indices].astype(np.float64, copy=False)
-        T_current_reference = se3.invert(T_reference_current)
-        warps = patch_warps(uvd, slopes, T_current_reference, self.camera)
-        if not self._is_stereo:
-            return warps, None
-        return warps, move_slopes(uvd, slopes, T_current_reference, self.camera)
+        slopes = reference.slopes.take(indices, axis=0).astype(np.float64, copy=False)
+        surfaces = (
+            reference.uvd.take(indices, axis=0) - offset,
+            slopes,
+            T_current_reference,
+            self.camera,
+        )
+        return _Expected(
+            T_reference_current=T_reference_current,
+            indices=indices,
+            uvd=seen.take(in_view, axis=0),
+            warps=patch_warps(*surfaces),
+            slopes=move_slopes(*surfaces) if self._is_stereo else slopes,
+        )
 
     def _find_tracks(
         self,
-        frames: tuple[_Reference, KltObservations],
-        indices: IntArray,
-        start: FloatArray,
-        warps: FloatArray | None,
+        reference: _Reference,
+        current: KltObservations,
+        expected: _Expected,
         search: _Search,
     ) -> tuple[FloatArray, BoolArray]:
-        """Return the pixels of corners of the reference in the current image, and which are found.
+        """Return the pixels of expected corners in the current image, and which are found.
 
         Lucas-Kanade finds a patch wherever it went, but as if it had only been moved. From there,
         or from a good prediction, the patch is aligned as it looks after the predicted motion;
-        a wide search has no such motion, and no warps.
+        a wide search has no such motion.
         """
-        reference, current = frames
-        if warps is not None and search == "aligned":
-            return self._align(frames, indices, start, warps)
+        start = expected.uvd[:, :2]
+        if search == "aligned":
+            return self._align(reference, current, expected, start)
         klt = self._config.klt
         kept = cast(KltObservations, reference)  # a place is only aligned
-        places = reference.keypoints[indices], start
-        if warps is None:
+        places = kept.keypoints[expected.indices], start
+        if search == "wide":
             images, n_levels = (kept.image, current.image), klt.n_wide_levels
             return track_pixels(images, *places, klt, n_levels=n_levels, is_checked=True)
         pixels, is_tracked = track_roughly((kept.half, current.half), *places, klt)
         tracked = np.flatnonzero(is_tracked)
-        chosen = indices[tracked], pixels[tracked], warps[tracked]
-        aligned, is_found = self._align(frames, *chosen)
-        is_found &= np.hypot(*(aligned - pixels[tracked]).T) < _MAX_ALIGN_PX
+        roughly = pixels.take(tracked, axis=0)
+        aligned, is_found = self._align(reference, current, expected.take(tracked), roughly)
+        is_found &= np.hypot(*(aligned - roughly).T) < _MAX_ALIGN_PX
         pixels[tracked], is_tracked[tracked] = aligned, is_found
         return pixels, is_tracked
 
     def _align(
         self,
-        frames: tuple[_Reference, KltObservations],
-        indices: IntArray,
+        reference: _Reference,
+        current: KltObservations,
+        expected: _Expected,
         start: FloatArray,
-        warps: FloatArray,
     ) -> tuple[FloatArray, BoolArray]:
-        templates = frames[0].templates.take(indices)
-        pixels, is_found = templates.align(frames[1].image, start, warps)
+        templates = reference.templates.take(expected.indices)
+        pixels, is_found = templates.align(current.image, start, expected.warps)
         return pixels, is_found & self.camera.is_in_view(pixels)
 
     def _measure(
-        self, frame: Frame, pixels: FloatArray, predicted: FloatArray, slopes: FloatArray | None
+        self, frame: Frame, pixels: FloatArray, expected: _Expected, search: _Search
     ) -> tuple[FloatArray, BoolArray]:
         """Measure the disparities of tracks, virtual ones of RGB-D."""
         if isinstance(frame, RgbdFrame):
             return self._measure_depth(frame, pixels)
-        return self._measure_stereo(frame, pixels, predicted, slopes)
-
-    def _measure_stereo(
-        self,
-        frame: StereoFrame,
-        pixels: FloatArray,
-        predicted: FloatArray,
-        slopes: FloatArray | None,
-    ) -> tuple[FloatArray, BoolArray]:
-        """Measure the disparities of tracks near predicted ones; without slopes, search wider."""
         config, images = self._config.stereo, (frame.left, frame.right)
         offset_px, row_offset_px = self._offsets_px()
-        follow = partial(follow_disparities, n_steps=_N_TRACK_STEPS, slopes=slopes)
-        measure = measure_disparities if slopes is None else follow
+        follow = partial(follow_disparities, n_steps=_N_TRACK_STEPS, slopes=expected.slopes)
+        measure = measure_disparities if search == "wide" else follow
         disparities, is_valid = measure(
-            images, pixels, predicted, config, row_offset_px=row_offset_px
+            images, pixels, expected.uvd[:, 2], config, row_offset_px=row_offset_px
         )
         note("klt.followed", disparities=disparities, is_at_rest=is_valid)
         return disparities, is_valid & self._is_in_range(disparities, offset_px)
@@ -551,6 +537,41 @@ class KltCorners:
     templates: Templates
     n_keypoints: int
     row_px: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Expected:
+    """The corners of a reference that a motion brings into view of another frame.
+
+    Parameters
+    ----------
+    T_reference_current : ndarray of float64, shape (4, 4)
+        The motion, metres.
+    indices : ndarray of int64, shape (n,)
+        Of the corners, among those of the reference.
+    uvd : ndarray of float64, shape (n, 3)
+        Pixels and disparities that the other frame should measure.
+    warps : ndarray of float64, shape (n, 2, 2)
+        See `patch_warps`.
+    slopes : ndarray of float64, shape (n, 2)
+        Change of the disparities per pixel, there.
+    """
+
+    T_reference_current: FloatArray
+    indices: IntArray
+    uvd: FloatArray
+    warps: FloatArray
+    slopes: FloatArray
+
+    def take(self, chosen: IntArray) -> _Expected:
+        """Select corners by index."""
+        return _Expected(
+            T_reference_current=self.T_reference_current,
+            indices=self.indices.take(chosen),
+            uvd=self.uvd.take(chosen, axis=0),
+            warps=self.warps.take(chosen, axis=0),
+            slopes=self.slopes.take(chosen, axis=0),
+        )
 
 
 class _Reference(Protocol):
