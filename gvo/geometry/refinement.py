@@ -124,20 +124,22 @@ def refine_pose(
     n_first = min(_N_FIRST_ITERATIONS, config.n_iterations)
     # Unobservable directions may give steps that are not finite; they are checked.
     with np.errstate(over="ignore", invalid="ignore"):
-        rough = _gauss_newton(T_target_source, residuals.select(inliers), n_iterations=n_first)
-        if isinstance(rough, Failure):
-            return rough
+        first = _gauss_newton(T_target_source, residuals.select(inliers), n_iterations=n_first)
+        if isinstance(first, Failure):
+            return first
+        rough, _ = first
         chosen = residuals.within(rough, config.gate)
         if np.count_nonzero(chosen) < np.count_nonzero(inliers) // 2:
             chosen = inliers
         note("refinement.gated", T_target_source=rough, inliers=chosen)
         every, residuals = residuals, residuals.select(chosen)
-        T = _gauss_newton(rough, residuals, n_iterations=config.n_iterations)
-        if isinstance(T, Failure):
-            return T
+        second = _gauss_newton(rough, residuals, n_iterations=config.n_iterations)
+        if isinstance(second, Failure):
+            return second
+        T, last = second
         # Orthonormal to the last digit: many motions are composed with this one.
         T = se3.normalize(T)
-        return _with_covariance(T, residuals, (chosen, every))
+        return _with_covariance(T, residuals, last or residuals.linearize(T), (chosen, every))
 
 
 def descend(
@@ -154,8 +156,8 @@ def descend(
         Maximum number.
     """
     with np.errstate(over="ignore", invalid="ignore"):
-        T = _gauss_newton(T_target_source, residuals, n_iterations=n_iterations)
-    return None if isinstance(T, Failure) else T
+        found = _gauss_newton(T_target_source, residuals, n_iterations=n_iterations)
+    return None if isinstance(found, Failure) else found[0]
 
 
 def fit_covariance(
@@ -171,41 +173,45 @@ def fit_covariance(
     """
     residuals = StereoResiduals.of(T_target_source, matches, camera, huber=config.huber)
     note("refinement.begin", residuals=residuals)
-    return _with_covariance(T_target_source, residuals.select(inliers), (inliers, residuals))
+    used = residuals.select(inliers)
+    last = used.linearize(T_target_source)
+    return _with_covariance(T_target_source, used, last, (inliers, residuals))
 
 
 def _gauss_newton(
     T: FloatArray, residuals: StereoResiduals, *, n_iterations: int
-) -> FloatArray | Failure:
-    """Return the pose after the last step; after a short step the Jacobian is reused."""
+) -> tuple[FloatArray, Linearization | None] | Failure:
+    """Return the pose after the last step, and the linearization there if that did not matter.
+
+    After a short step the Jacobian is reused.
+    """
     max_gain = _SHORT**2 * residuals.columns.shape[1]
     near: Linearization | None = None
     for _ in range(n_iterations):
-        at = near or residuals.linearize(T)
+        at = residuals.linearize(T, near)
         if isinstance(at, Failure):
             return at
-        g = residuals.gradient(T, near) if near else at.g
-        if isinstance(g, Failure):
-            return g
         # LAPACK called directly: numpy takes several times as long for so small a matrix.
-        _, step, info = dposv(at.H, g)
+        _, step, info = dposv(at.H, at.g)
         if info != 0 or not np.isfinite(step).all():
             return Failure(reason=_OPEN)
         # Not the exponential map but a retraction: the same to first order, and cheap.
         T = se3.make_transform(cv2.Rodrigues(step[:3])[0], step[3:]) @ T
         note("refinement.step", T_target_source=T, step=step)
-        gain = step @ g
+        gain = step @ at.g
         if gain < _CONVERGED:
-            break
+            return T, at
         near = at if gain < max_gain else None
-    return T
+    return T, None
 
 
 def _with_covariance(
-    T: FloatArray, residuals: StereoResiduals, inliers: tuple[BoolArray, StereoResiduals]
+    T: FloatArray,
+    residuals: StereoResiduals,
+    last: Linearization | Failure,
+    inliers: tuple[BoolArray, StereoResiduals],
 ) -> Refinement | Failure:
     """Finish a refinement; `inliers` are the mask of the matches used and the residuals of all."""
-    last = residuals.linearize(T)
     if isinstance(last, Failure):
         return last
     _, H_inverse, info = dposv(last.H, _IDENTITY)

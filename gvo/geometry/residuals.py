@@ -99,11 +99,11 @@ class Linearization:
     Parameters
     ----------
     J : ndarray of float64, shape (6, 3, n)
-        Of the predictions by the pose.
+        Of the predictions by the pose, or by one near it.
     r : ndarray of float64, shape (3, n)
         Residuals: measurement less prediction.
     roots : ndarray of float64, shape (n,)
-        Square roots of the robust weights.
+        Square roots of the robust weights where J was taken.
     factors : ndarray of float64, shape (6, n)
         Factors W of `StereoResiduals`, times these roots.
     H : ndarray of float64, shape (6, 6)
@@ -229,12 +229,26 @@ class StereoResiduals:
         # An error moves the measurement in the target directly, the prediction through the source.
         return in_target - np.einsum("jin,kjn->kin", J, in_source), in_target.copy()
 
-    def linearize(self, T: FloatArray) -> Linearization | Failure:
-        """Linearize at T; a failure if points fall behind the camera."""
+    def linearize(
+        self, T: FloatArray, near: Linearization | None = None
+    ) -> Linearization | Failure:
+        """Linearize at T; a failure if points fall behind the camera.
+
+        Parameters
+        ----------
+        T : ndarray of float64, shape (4, 4)
+            T_target_source.
+        near : Linearization, optional
+            Of a pose near it, whose Jacobian is taken, for half of the time: in the last steps it
+            hardly changes, residuals and weights do. With either, g is zero at the optimum.
+        """
         points = self._moved(T)
         if isinstance(points, Failure):
             return points
         r, roots = self._weighed(points)
+        if near is not None:
+            r *= roots**2 / near.roots
+            return replace(near, r=r, g=near.J.reshape(6, -1) @ r.ravel())
         r *= roots
         factors = self.columns[6:12] * roots
         J = pose_jacobian(points, self.camera)
@@ -243,19 +257,6 @@ class StereoResiduals:
         return Linearization(
             J=J, r=r, roots=roots, factors=factors, H=flat @ flat.T, g=flat @ r.ravel()
         )
-
-    def gradient(self, T: FloatArray, near: Linearization) -> FloatArray | Failure:
-        """Return g, shape (6,), at T, with the Jacobian of a pose near it.
-
-        In the last steps the Jacobian hardly changes, residuals and weights do; with either, g is
-        zero at the optimum. This takes a third of the time of a linearization.
-        """
-        points = self._moved(T)
-        if isinstance(points, Failure):
-            return points
-        r, roots = self._weighed(points)
-        r *= roots**2 / near.roots
-        return np.asarray(near.J.reshape(6, -1) @ r.ravel())
 
     def within(self, T: FloatArray, gate: float) -> BoolArray:
         """Tell which residuals are shorter than a gate in sigmas; none behind the camera."""
