@@ -132,22 +132,20 @@ def refine_pose(
     n_first = min(_N_FIRST_ITERATIONS, config.n_iterations)
     # Unobservable directions may give steps that are not finite; they are checked.
     with np.errstate(over="ignore", invalid="ignore"):
-        first = _gauss_newton(T_target_source, residuals.select(inliers), n_iterations=n_first)
-        if isinstance(first, Failure):
-            return first
-        rough, _ = first
+        rough = _gauss_newton(T_target_source, residuals.select(inliers), n_iterations=n_first)
+        if isinstance(rough, Failure):
+            return rough
         squared = residuals.squared(rough)
         excess = max(noise_variance(squared[inliers]) - 1.0, 0.0)
         chosen = squared < config.gate**2 * (1.0 + _WIDENING * excess)
         note("refinement.gated", T_target_source=rough, inliers=chosen)
         every, residuals = residuals, residuals.select(chosen)
-        second = _gauss_newton(rough, residuals, n_iterations=config.n_iterations)
-        if isinstance(second, Failure):
-            return second
-        T, last = second
+        T = _gauss_newton(rough, residuals, n_iterations=config.n_iterations)
+        if isinstance(T, Failure):
+            return T
         # Orthonormal to the last digit: many motions are composed with this one.
         T = se3.normalize(T)
-        return _with_covariance(T, residuals, last or residuals.linearize(T), (chosen, every))
+        return _with_covariance(T, residuals, (chosen, every))
 
 
 def descend(
@@ -164,8 +162,8 @@ def descend(
         Maximum number.
     """
     with np.errstate(over="ignore", invalid="ignore"):
-        found = _gauss_newton(T_target_source, residuals, n_iterations=n_iterations)
-    return None if isinstance(found, Failure) else found[0]
+        T = _gauss_newton(T_target_source, residuals, n_iterations=n_iterations)
+    return None if isinstance(T, Failure) else T
 
 
 def fit_covariance(
@@ -181,18 +179,13 @@ def fit_covariance(
     """
     residuals = StereoResiduals.of(T_target_source, matches, camera, huber=config.huber)
     note("refinement.begin", residuals=residuals)
-    used = residuals.select(inliers)
-    last = used.linearize(T_target_source)
-    return _with_covariance(T_target_source, used, last, (inliers, residuals))
+    return _with_covariance(T_target_source, residuals.select(inliers), (inliers, residuals))
 
 
 def _gauss_newton(
     T: FloatArray, residuals: StereoResiduals, *, n_iterations: int
-) -> tuple[FloatArray, Linearization | None] | Failure:
-    """Return the pose after the last step, and the linearization there if that did not matter.
-
-    After a short step the Jacobian is reused.
-    """
+) -> FloatArray | Failure:
+    """Return the pose after the last step; after a short step the Jacobian is reused."""
     max_gain = _SHORT**2 * residuals.columns.shape[1]
     near: Linearization | None = None
     for _ in range(n_iterations):
@@ -208,18 +201,16 @@ def _gauss_newton(
         note("refinement.step", T_target_source=T, step=step)
         gain = step @ at.g
         if gain < _CONVERGED:
-            return T, at
+            break
         near = at if gain < max_gain else None
-    return T, None
+    return T
 
 
 def _with_covariance(
-    T: FloatArray,
-    residuals: StereoResiduals,
-    last: Linearization | Failure,
-    inliers: tuple[BoolArray, StereoResiduals],
+    T: FloatArray, residuals: StereoResiduals, inliers: tuple[BoolArray, StereoResiduals]
 ) -> Refinement | Failure:
     """Finish a refinement; `inliers` are the mask of the matches used and the residuals of all."""
+    last = residuals.linearize(T)
     if isinstance(last, Failure):
         return last
     _, H_inverse, info = dposv(last.H, _IDENTITY)
