@@ -137,8 +137,11 @@ def refine_pose(
             return rough
         squared = residuals.squared(rough)
         excess = max(noise_variance(squared[inliers]) - 1.0, 0.0)
-        chosen = squared < config.gate**2 * (1.0 + _WIDENING * excess)
-        note("refinement.gated", T_target_source=rough, inliers=chosen)
+        gate = config.gate * math.sqrt(1.0 + _WIDENING * excess)
+        chosen = squared < gate**2
+        if np.count_nonzero(chosen) < np.count_nonzero(inliers) // 2:
+            chosen = inliers
+        note("refinement.gated", T_target_source=rough, inliers=chosen, gate=gate)
         every, residuals = residuals, residuals.select(chosen)
         T = _gauss_newton(rough, residuals, n_iterations=config.n_iterations)
         if isinstance(T, Failure):
