@@ -58,7 +58,7 @@ _N_FIRST_ITERATIONS = 2
 # rounding.
 _MIN_SHARE = 1e-10
 # By how much the square of the gate grows with the variance above that stated: a motion that is
-# not settled leaves long tails. With 1 and 2 the matches of a turning Kinect are cut in two still.
+# not settled leaves long tails. With 1 and 2 the chain of a turning Kinect is less accurate.
 _WIDENING = 4.0
 # The median of the squared length of three residuals of variance one.
 _MEDIAN_SQUARED = 2.366
