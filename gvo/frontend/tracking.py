@@ -42,10 +42,9 @@ _NOISE = 1.0
 # the steepest slope that a surface has in the target.
 _MIN_DISTANCE = 0.05
 _MAX_SLOPE = 0.75
-# An alignment makes so many steps, and so many more of patches that the last of them moved by more
-# than this.
+# An alignment makes so many steps; as many again are made by patches that the last of them moved by
+# more than this.
 _N_STEPS = 2
-_N_MORE_STEPS = 3
 _MOVING_PX = 0.03
 # A step of the alignment moves a patch by at most so much; it is at rest below so much.
 _MAX_STEP_PX = 1.0
@@ -362,22 +361,21 @@ class Templates:
             False where the search does not come to rest, or what it finds is unlike the patch.
         """
         single = warps.astype(np.float32)
-        pixels, unlike, moves = self._steps(image, start, single, _N_STEPS)
+        pixels, unlike, moves = self._steps(image, start, single)
         moving = np.flatnonzero(moves > _MOVING_PX)
         if len(moving):
-            seen = image, pixels[moving], single[moving]
-            more = self.take(moving)._steps(*seen, _N_MORE_STEPS)
+            more = self.take(moving)._steps(image, pixels[moving], single[moving])
             pixels[moving], unlike[moving], moves[moving] = more
         variances = np.einsum("ni,ni->n", self.values, self.values) / self.values.shape[1]
         are_alike = unlike <= _MAX_UNLIKE * variances + _UNLIKE_NOISE
         return pixels, are_alike & (moves < _MAX_LAST_STEP_PX)
 
     def _steps(
-        self, image: ImageArray, start: FloatArray, warps: NDArray[np.float32], n_steps: int
+        self, image: ImageArray, start: FloatArray, warps: NDArray[np.float32]
     ) -> tuple[FloatArray, NDArray[np.float32], FloatArray]:
-        """Return pixels after steps, how unlike the patches are there, and the last moves."""
+        """Return pixels after some steps, how unlike the patches are there, and the last moves."""
         pixels = start.copy()
-        for _ in range(n_steps):
+        for _ in range(_N_STEPS):
             # Its mean has no effect: that of the gradients is zero.
             differences = sample_warped(image, pixels, warps) - self.values
             slopes = np.einsum("nij,nj->ni", self.gradients, differences)

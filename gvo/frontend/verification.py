@@ -20,7 +20,6 @@ doi:10.1098/rsta.1998.0224.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -32,7 +31,7 @@ from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.ransac import ransac_rigid
-from gvo.geometry.refinement import Refinement, descend, noise_variance, refine_pose
+from gvo.geometry.refinement import Refinement, descend, refine_pose
 from gvo.types import BoolArray, Contradiction, Failure, FloatArray, MotionPrior
 
 # Smallest share of the matches that makes a second motion: below, it is a car in the distance, or
@@ -51,7 +50,9 @@ _N_STEPS = 1
 _APART_PX = 0.3
 _APART_UNPREDICTED_PX = 1.0
 _MIN_DEPTH_M = 0.1
-# The smallest scale of the noise: a recording may hold two copies of one image.
+# The median of the squared length of three residuals of variance one, and the smallest scale of
+# the noise: a recording may hold two copies of one image.
+_MEDIAN_SQUARED = 2.366
 _MIN_SCALE = 0.1
 # Noise as large as stated, or nearly: the gate alone separates the motions.
 _MAX_SCALE = 2.0 / 3.0
@@ -258,10 +259,10 @@ def _prefer_recent_motion(found: Refinement, problem: _Problem, T_recent: FloatA
     if np.count_nonzero(seeds) < problem.n_needed:
         return found
     # The smaller residual of either motion shows the noise.
-    scale = math.sqrt(noise_variance(np.minimum(squared, recently)))
+    scale = np.sqrt(np.median(np.minimum(squared, recently)) / _MEDIAN_SQUARED)
     if scale > _MAX_SCALE:
         return found
-    gate = problem.config.registration.gate * max(scale, _MIN_SCALE)
+    gate = problem.config.registration.gate * max(float(scale), _MIN_SCALE)
     misfits = squared >= gate**2
     T_other = _descend(found, T_recent, seeds & misfits, problem.n_needed)
     if T_other is None:

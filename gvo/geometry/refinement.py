@@ -57,11 +57,6 @@ _N_FIRST_ITERATIONS = 2
 # Information on a constant, relative to that of the target's measurements alone, below which it is
 # rounding.
 _MIN_SHARE = 1e-10
-# By how much the square of the gate grows with the variance above that stated: a motion that is
-# not settled leaves long tails. With 1 and 2 the chain of a turning Kinect is less accurate.
-_WIDENING = 4.0
-# The median of the squared length of three residuals of variance one.
-_MEDIAN_SQUARED = 2.366
 _IDENTITY = np.eye(6)
 _OPEN = "the matches leave a direction of motion open"
 
@@ -106,9 +101,6 @@ def refine_pose(
     The inliers of a minimal sample are biased towards its error, which shortens or stretches the
     motion: after a few iterations they are chosen again from all matches.
 
-    Where the noise is larger than stated, as of depth that was measured at another time than the
-    image, the gate is wider. Else it would cut the matches in two, and either half fits itself.
-
     Parameters
     ----------
     T_target_source : ndarray of float64, shape (4, 4)
@@ -120,7 +112,7 @@ def refine_pose(
     camera : StereoCamera
         Of both frames.
     config : RegistrationConfig
-        Iterations, kernel threshold, gate in stated sigmas.
+        Iterations, kernel threshold, gate.
 
     Returns
     -------
@@ -135,13 +127,10 @@ def refine_pose(
         rough = _gauss_newton(T_target_source, residuals.select(inliers), n_iterations=n_first)
         if isinstance(rough, Failure):
             return rough
-        squared = residuals.squared(rough)
-        excess = max(noise_variance(squared[inliers]) - 1.0, 0.0)
-        gate = config.gate * math.sqrt(1.0 + _WIDENING * excess)
-        chosen = squared < gate**2
+        chosen = residuals.within(rough, config.gate)
         if np.count_nonzero(chosen) < np.count_nonzero(inliers) // 2:
             chosen = inliers
-        note("refinement.gated", T_target_source=rough, inliers=chosen, gate=gate)
+        note("refinement.gated", T_target_source=rough, inliers=chosen)
         every, residuals = residuals, residuals.select(chosen)
         T = _gauss_newton(rough, residuals, n_iterations=config.n_iterations)
         if isinstance(T, Failure):
@@ -248,12 +237,6 @@ def _sensitivity(
     _, inverse, info = dposv(at.H - pulls @ pulls.T, _IDENTITY)
     is_sane = info == 0 and np.all(np.diagonal(inverse) < _MAX_LOSS * np.diagonal(H_inverse))
     return np.asarray(inverse) if is_sane else H_inverse
-
-
-def noise_variance(squared: FloatArray) -> float:
-    """Return the variance of residuals over that stated, by the median of their squares (n,)."""
-    middle = len(squared) // 2
-    return float(np.partition(squared, middle)[middle]) / _MEDIAN_SQUARED
 
 
 def _scale(at: Linearization) -> float:

@@ -13,13 +13,7 @@ from gvo._trace import Event, watched
 from gvo.config import RegistrationConfig
 from gvo.geometry import se3
 from gvo.geometry.correspondences import Correspondences
-from gvo.geometry.refinement import (
-    Refinement,
-    descend,
-    fit_covariance,
-    noise_variance,
-    refine_pose,
-)
+from gvo.geometry.refinement import Refinement, descend, fit_covariance, refine_pose
 from gvo.geometry.residuals import StereoResiduals
 from gvo.types import Failure, FloatArray
 from tests.geometry.scenes import (
@@ -207,10 +201,9 @@ def test_steps_end_where_they_are_a_thirtieth_of_a_sigma() -> None:
         assert first == n_steps
 
 
-@pytest.mark.parametrize(("n_wrong", "n_kept"), [(0, 10), (9, 10), (11, 21), (25, 35)])
+@pytest.mark.parametrize(("n_wrong", "n_kept"), [(0, 10), (10, 10), (11, 10), (12, 22), (25, 35)])
 def test_a_choice_that_loses_half_of_the_inliers_is_not_taken(n_wrong: int, n_kept: int) -> None:
-    # The wrong ones are so unsure that they do not move the pose, and beyond the gate as stated:
-    # where they are most of the matches, they are the noise.
+    # The wrong ones are so unsure that they do not move the pose, and beyond the gate.
     rng = np.random.default_rng(3)
     errors = np.zeros((10 + n_wrong, 3))
     errors[10:] = 10.0
@@ -223,17 +216,6 @@ def test_a_choice_that_loses_half_of_the_inliers_is_not_taken(n_wrong: int, n_ke
     assert isinstance(found, Refinement)
     assert np.count_nonzero(found.inliers) == n_kept
     assert found.inliers[:10].all()
-
-
-@pytest.mark.parametrize("noise", [0.5, 1.0, 1.5, 3.0])
-def test_noise_larger_than_stated_does_not_cut_the_matches_in_two(noise: float) -> None:
-    rng = np.random.default_rng(4)
-    T, matches = measure(rng, noise * rng.normal(size=(400, 3)))
-    found = refine_pose(T, matches, all_of(matches), CAMERA, SETTINGS)
-    assert isinstance(found, Refinement)
-    assert np.mean(found.inliers) > 0.95
-    squared = residuals_of(T, matches).squared(T)
-    np.testing.assert_allclose(noise_variance(squared), noise**2, rtol=0.15)
 
 
 def test_a_refined_pose_is_a_rotation_to_the_last_digit() -> None:

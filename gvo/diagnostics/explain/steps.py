@@ -349,12 +349,11 @@ def explain_refinement(attempt: Trace, camera: StereoCamera, config: Config) -> 
     )
     if not after.get("refined"):
         return None
-    matches = begin["correspondences"]
+    matches, gate = begin["correspondences"], config.registration.gate
     ends: tuple[Consensus, Refinement] = before["consensus"], after["refined"]
     start, gated = attempt.find("refinement.begin"), attempt.find("refinement.gated")
     residuals_px = [_residuals(each.T_target_source, matches, camera) for each in ends]
     whitened = [_whiten(each, start["residuals"]) for each in residuals_px]
-    gate = gated["gate"] if gated else config.registration.gate
     within = start["residuals"].within(gated["T_target_source"], gate) if gated else None
     return Step(
         n_steps=len(attempt.before("registration.refined").all("refinement.step")),

@@ -300,7 +300,7 @@ def _gate_text(step: Step) -> str:
     (before, after), n_within_gate = step.n_inliers, step.n_within_gate
     if n_within_gate is None:
         return f"Pose and matches stay as they are, {after} (registration.refine none)."
-    gate = f"The gate of {step.gate_sigma:.3g} sigma (registration.gate, or more in larger noise)"
+    gate = f"The gate of {step.gate_sigma:g} sigma (registration.gate)"
     if n_within_gate == after:
         return (
             f"{gate} chooses the matches again after the first steps: {before} before, "
