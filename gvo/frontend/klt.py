@@ -202,7 +202,7 @@ class KltFrontend:
         """
         frames = reference, current
         expected = self._predict(prior.T_predicted, *frames)
-        aligned = self._register_link(prior, self._track(*frames, expected, "aligned"))
+        aligned = self._register_link(prior, *frames, expected, "aligned")
         if isinstance(aligned, Contradiction):
             return aligned
         if isinstance(aligned, RelativePose):
@@ -211,7 +211,7 @@ class KltFrontend:
                 return aligned
         if not self._is_seen_again(*frames, expected):
             return aligned
-        tracked = self._register_link(prior, self._track(*frames, expected, "near"))
+        tracked = self._register_link(prior, *frames, expected, "near")
         if isinstance(aligned, Failure):
             return tracked
         is_more = isinstance(tracked, RelativePose) and tracked.n_inliers > aligned.n_inliers
@@ -306,9 +306,7 @@ class KltFrontend:
             return rough
         prior = MotionPrior(T_predicted=rough.T_reference_current)
         expected = self._predict(prior.T_predicted, reference, observations)
-        result = self._register_link(
-            prior, self._track(reference, observations, expected, "aligned")
-        )
+        result = self._register_link(prior, reference, observations, expected, "aligned")
         checked = check_view(result, reference.points_cam, self.camera)
         points, frame = reference.depth_points, observations.frame
         if isinstance(result, Failure) or points is None or not isinstance(frame, RgbdFrame):
@@ -367,7 +365,16 @@ class KltFrontend:
             is_step=True,
         )
 
-    def _register_link(self, prior: MotionPrior, measured: Measurements) -> RelativePose | Failure:
+    def _register_link(
+        self,
+        prior: MotionPrior,
+        reference: _Reference,
+        current: KltObservations,
+        expected: _Expected,
+        search: _Search,
+    ) -> RelativePose | Failure:
+        """Track expected corners, measure in 3-D, register; velocities stay as they are."""
+        measured = self._track(reference, current, expected, search)
         return self._calibrated.register(measured, self._config, prior=prior, is_step=False)
 
     def _sigmas(self, n: int) -> tuple[FloatArray, FloatArray]:

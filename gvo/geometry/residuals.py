@@ -239,8 +239,8 @@ class StereoResiduals:
         T : ndarray of float64, shape (4, 4)
             T_target_source.
         near : Linearization, optional
-            Of a pose near it, whose Jacobian is taken, for half of the time: in the last steps it
-            hardly changes, residuals and weights do. With either, g is zero at the optimum.
+            Of a pose near it, whose Jacobian is taken, in two fifths of the time: in the last steps
+            it hardly changes, residuals and weights do. With either, g is zero at the optimum.
         """
         points = self._moved(T)
         if isinstance(points, Failure):
