@@ -18,7 +18,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import zip_longest
 from typing import Any
 from weakref import WeakKeyDictionary, ref
 
@@ -30,6 +29,9 @@ from gvo.frontend.registration import check_rows, estimate_roughly, register_cor
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
+from gvo.geometry.ransac import find_inliers
+from gvo.geometry.refinement import adjust
+from gvo.geometry.residuals import StereoResiduals
 from gvo.types import (
     ConstantError,
     Failure,
@@ -47,11 +49,13 @@ DISPARITY, READOUT = "disparity_px", "readout_s"
 _DISPARITY_FACTOR = 3.0
 _READOUT_FACTOR = 5.0
 # What registrations are told to doubt besides.
-_VELOCITY = "velocity"
-# Sigma of the newest frame's velocity, relative to the change from the step before to the last one,
-# and of this change along each axis, relative to the last step, where the step before is unknown.
-_SIGMA_OF_CHANGE = 1.0
+_VELOCITIES = tuple(f"velocity{axis}" for axis in range(6))
+# Change of the newest frame's velocity, relative to the last step, where that before is unknown;
+# and the smallest sigma along an axis, rad/s and m/s.
 _FIRST_CHANGE = 0.2
+_LEAST_CHANGE = 0.01
+# Gauss-Newton steps of a velocity that is measured.
+_N_ITERATIONS = 3
 # A row offset of the right image, the median of many measurements, that is worth a word.
 _LEAST_ROW_PX = 0.04
 # Stamps nearer to each other than this, in seconds, tell no velocity.
@@ -62,7 +66,6 @@ _FEIGNED_PX = 0.05
 # Sigmas of the row offset measured in one frame, and of its prior, pixels.
 _ROW_SIGMA_PX = 0.1
 _ROW_PRIOR_PX = 0.3
-_NO_DOUBTS = np.empty((0, 6))
 # Sigma of the prior of the readout time, seconds: rolling shutters take 5 to 33 ms. Below the lower
 # one a readout that may be zero is taken for zero.
 _READOUT_PRIOR_S = 0.03
@@ -161,17 +164,44 @@ class VarianceFactor:
         self.value = min(max(value, self._least), 1.0)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MeasuredVelocity:
+    """What the rows of the newest frame tell of its velocity, beside the step that leads to it.
+
+    Parameters
+    ----------
+    sigmas : ndarray of float64, shape (6,)
+        Of the velocity as extrapolated, rad/s and m/s.
+    values : ndarray of float64, shape (6,)
+        By how much it differs from that, in these sigmas.
+    covariance : ndarray of float64, shape (6, 6)
+        Of what is left, in the same.
+    effects : ndarray of float64, shape (6, 6)
+        Derivative of the pose of this frame, right perturbation, by its velocity.
+    T_target_source : ndarray of float64, shape (4, 4)
+        The step, inverted.
+    """
+
+    sigmas: FloatArray
+    values: FloatArray
+    covariance: FloatArray
+    effects: FloatArray
+    T_target_source: FloatArray
+
+
 class FrameVelocities:
     """The velocities of frames while they were exposed, of the steps before and after each.
 
-    They are those of the chain of steps alone: no pose of the window enters. Frames are forgotten
-    with their observations.
+    Beside them counts what the rows of the newest frame tell. They are those of the chain of steps
+    alone: no pose of the window enters. Frames are forgotten with their observations.
     """
 
     def __init__(self) -> None:
         self._steps: WeakKeyDictionary[Stamped, FloatArray] = WeakKeyDictionary()
         self._velocities: WeakKeyDictionary[Stamped, FloatArray] = WeakKeyDictionary()
-        self._doubts: WeakKeyDictionary[Stamped, FloatArray] = WeakKeyDictionary()
+        self._sigmas: WeakKeyDictionary[Stamped, FloatArray] = WeakKeyDictionary()
+        self._measured: WeakKeyDictionary[Stamped, MeasuredVelocity] = WeakKeyDictionary()
+        self._ends: WeakKeyDictionary[Stamped, FloatArray] = WeakKeyDictionary()
         self._starts: WeakKeyDictionary[Stamped, ref[Stamped]] = WeakKeyDictionary()
 
     def expect(
@@ -187,20 +217,20 @@ class FrameVelocities:
         if abs(elapsed_s) < _MIN_ELAPSED_S:
             return
         before = self._steps.get(reference)
+        self._measured.pop(current, None)
         if T_reference_current is None:
             self._steps.pop(current, None)
             for observations in (reference, current):
                 self._velocities.pop(observations, None)
-                self._doubts.pop(observations, None)
+                self._sigmas.pop(observations, None)
             if before is not None:
-                self._velocities[reference] = before
+                self._velocities[reference] = self._ends.get(reference, before)
             return
         step = se3.log(T_reference_current) / elapsed_s
         self._steps[current] = step
         if before is None:
             self._velocities[reference] = self._velocities[current] = step
-            turn, shift = np.linalg.norm(step[:3]), np.linalg.norm(step[3:])
-            self._doubts[current] = _FIRST_CHANGE * np.diag([turn] * 3 + [shift] * 3)
+            self._sigmas[current] = _along_each_axis(_FIRST_CHANGE * math.sqrt(3.0) * step)
             self._starts[current] = ref(reference)
             return
         start = self._starts[reference]() if reference in self._starts else None
@@ -208,8 +238,14 @@ class FrameVelocities:
             self._velocities[start] = before - 0.5 * (step - before)
         self._velocities[reference] = 0.5 * (before + step)
         self._velocities[current] = step + 0.5 * (step - before)
-        self._doubts.pop(reference, None)
-        self._doubts[current] = _SIGMA_OF_CHANGE * (step - before)[np.newaxis]
+        self._sigmas.pop(reference, None)
+        self._sigmas[current] = _along_each_axis(step - before)
+
+    def measure(self, observations: Stamped, measured: MeasuredVelocity) -> None:
+        """Add what the rows of the newest frame tell to its velocity."""
+        velocity = self._velocities[observations] + measured.sigmas * measured.values
+        self._velocities[observations] = self._ends[observations] = velocity
+        self._measured[observations] = measured
 
     def of(self, observations: Stamped) -> FloatArray | None:
         """Return a twist per second (rad/s, m/s), right of the pose; None where it is unknown."""
@@ -217,18 +253,38 @@ class FrameVelocities:
 
     def copy(self, observations: Stamped, other: Stamped) -> None:
         """Let the same frame in another form have the same velocity."""
-        velocity = self.of(observations)
-        if velocity is not None:
-            self._velocities[other] = velocity
+        for each in (self._velocities, self._measured, self._ends):
+            if observations in each:
+                each[other] = each[observations]
 
-    def doubts(self, observations: Stamped) -> FloatArray:
-        """Return by how much the velocity may be off, shape (k, 6): k independent sigmas.
+    def sigmas(self, observations: Stamped) -> FloatArray | None:
+        """Return the sigmas of the velocity as extrapolated, shape (6,); None where it is known.
 
-        There are none where the next step is known. The newest frame's velocity is extrapolated:
-        the camera may go on changing it, or not. In a first step, of which no change is known, it
-        may do so along any axis.
+        The newest frame's velocity may go on changing, or not, and turn aside: along each axis by
+        as much as it just changed. In a first step, of which no change is known, by a fifth.
         """
-        return self._doubts.get(observations, _NO_DOUBTS)
+        return self._sigmas.get(observations)
+
+    def measured(self, observations: Stamped) -> MeasuredVelocity | None:
+        """Return what the rows of the newest frame told of its velocity, if they did."""
+        return self._measured.get(observations) if observations in self._sigmas else None
+
+    def error(self, observations: Stamped) -> FloatArray | None:
+        """Return by how much the pose of a frame was off when it was the newest, a twist (6,).
+
+        Its velocity is known better since the next step. The pose that its own step led to is the
+        one that all other frames are chained to.
+        """
+        measured, velocity = self._measured.get(observations), self.of(observations)
+        if measured is None or velocity is None:
+            return None
+        return np.asarray(measured.effects @ (velocity - self._ends[observations]))
+
+
+def _along_each_axis(change: FloatArray) -> FloatArray:
+    """Return the sigmas of a velocity (6,) that changes as much as this along any axis."""
+    turn, shift = (np.linalg.norm(part) / math.sqrt(3.0) for part in (change[:3], change[3:]))
+    return np.maximum([turn] * 3 + [shift] * 3, _LEAST_CHANGE)
 
 
 class RigOffsets:
@@ -559,7 +615,8 @@ class CalibratedCamera:
             As of `register_correspondences`.
         is_step : bool
             The result tells the velocities of both frames. Where these move what rows show, it is
-            estimated twice: roughly, with those predicted, then with its own.
+            estimated twice: roughly, with those predicted, then with its own, and what the rows of
+            the current frame tell.
 
         Returns
         -------
@@ -568,6 +625,7 @@ class CalibratedCamera:
         velocities = self._offsets.velocities
         first, second = measured.frames
         hints: dict[str, Any] = {"stamps_ns": (first.stamp_ns, second.stamp_ns), "prior": prior}
+        told: MeasuredVelocity | None = None
         # A first step has no velocity yet to start from.
         is_known = velocities.of(first) is not None
         if is_step and is_known and self._offsets.possible_readout_s > 0.0:
@@ -576,15 +634,22 @@ class CalibratedCamera:
             if not isinstance(rough, Failure):
                 hints["T_start"] = rough
                 velocities.expect(first, second, se3.invert(rough))
+                told = self._measure_velocity(measured, rough, config)
+            if told is not None:
+                hints["T_start"] = told.T_target_source
+                velocities.measure(second, told)
         result = self._register(measured, config, hints, is_step=is_step)
         if isinstance(result, Failure) and hints.pop("T_start", None) is not None:
             # What was found roughly may be the other one of two motions, or none.
             velocities.expect(first, second, (None if prior is None else prior.T_predicted))
+            told = None
             result = self._register(measured, config, hints, is_step=is_step)
         if isinstance(result, Failure):
             return result
         if is_step:
             velocities.expect(first, second, result.T_reference_current)
+            if told is not None:
+                velocities.measure(second, told)
         return check_rows(result, self._camera)
 
     def _register(
@@ -596,11 +661,14 @@ class CalibratedCamera:
             return result
         # In sigmas of what is known of each constant, as the sensitivities are.
         in_sigmas = result.calibration_errors
-        doubts = [np.outer(each.effect, each.effect) for each in in_sigmas.values()]
+        error = self._offsets.velocities.error(measured.frames[0])
+        T_correction = np.eye(4) if error is None else se3.exp(error)
         first_pixels, second_pixels = (uvd[:, :2] for uvd in measured.uvd)
         return replace(
             result,
-            covariance=measured.sigma_factor**2 * result.covariance + sum(doubts),
+            T_reference_current=T_correction @ result.T_reference_current,
+            covariance=measured.sigma_factor**2 * result.covariance
+            + self._covariance_by_constants(in_sigmas, measured.frames[1]),
             calibration_errors={
                 name: each.times(self._offsets.learnt[name].sigma)
                 for name, each in in_sigmas.items()
@@ -609,6 +677,64 @@ class CalibratedCamera:
             pixels_reference=first_pixels,
             pixels_current=second_pixels,
         )
+
+    def _covariance_by_constants(
+        self, in_sigmas: Mapping[str, ConstantError], current: Stamped
+    ) -> FloatArray:
+        """Return the covariance of a pose, shape (6, 6), by what constants are in doubt."""
+        effects = np.array([each.effect for each in in_sigmas.values()]).reshape(-1, 6)
+        left = np.eye(len(effects))
+        told = self._offsets.velocities.measured(current)
+        if told is not None:
+            axes = [_VELOCITIES.index(name) for name in in_sigmas if name in _VELOCITIES]
+            rows = [i for i, name in enumerate(in_sigmas) if name in _VELOCITIES]
+            left[np.ix_(rows, rows)] = told.covariance[np.ix_(axes, axes)]
+        return np.asarray(effects.T @ left @ effects)
+
+    def _measure_velocity(
+        self, measured: Measurements, T: FloatArray, config: Config
+    ) -> MeasuredVelocity | None:
+        """Estimate the velocity of the current frame together with the step, by all inliers.
+
+        A camera in the hand changes its velocity by as much as it has, from frame to frame: what
+        is extrapolated leaves rows some tenths of a pixel from where they belong.
+        """
+        offsets, current = self._offsets, measured.frames[1]
+        sigmas = offsets.velocities.sigmas(current)
+        if sigmas is None or offsets.readout_s == 0.0:
+            return None
+        # The measurements are as unsure as said by the inflated sigmas, relative to the velocity.
+        units = sigmas / measured.sigma_factor
+        prepared = replace(
+            self._corrected(measured),
+            sensitivities=self._by_velocity(measured, units, offsets.readout_s),
+        )
+        inliers = find_inliers(T[np.newaxis], prepared, self._camera, config.ransac)[0]
+        if np.count_nonzero(inliers) < config.ransac.min_inliers:
+            return None
+        residuals = StereoResiduals.of(
+            T, prepared, self._camera, huber=config.registration.huber
+        ).select(inliers)
+        found = adjust(T, residuals, n_iterations=_N_ITERATIONS)
+        if found is None:
+            return None
+        # The pose of the current frame is the inverse: what is left of one is right of the other.
+        return MeasuredVelocity(
+            sigmas=sigmas,
+            values=found.values / measured.sigma_factor,
+            covariance=found.covariance,
+            effects=-found.effects / units,
+            T_target_source=found.T_target_source,
+        )
+
+    def _by_velocity(
+        self, measured: Measurements, units: FloatArray, readout_s: float
+    ) -> dict[str, FloatArray]:
+        """Return the derivatives of corrected measurements by errors of the current velocity."""
+        return {
+            name: -readout_s * self._settling_rates(measured, (None, unit))
+            for name, unit in zip(_VELOCITIES, np.diag(units), strict=True)
+        }
 
     def _corrected(self, measured: Measurements) -> Correspondences:
         reference, current = (
@@ -623,20 +749,29 @@ class CalibratedCamera:
             name: self._sensitivity(name, measured) * constant.sigma
             for name, constant in self._offsets.learnt.items()
         }
-        # By how much they change if velocities are off by one sigma. The change of velocity that
-        # tells a step the readout is as large as its doubt: it counts before the readout is known.
+        # The change of velocity that tells a step the readout is as large as its doubt: it counts
+        # before the readout is known.
         readout_s = self._offsets.possible_readout_s if is_step else self._offsets.readout_s
-        if readout_s != 0.0:
-            doubts = [self._offsets.velocities.doubts(frame) for frame in measured.frames]
-            for i, each in enumerate(zip_longest(*doubts)):
-                sensitivities[f"{_VELOCITY}{i}"] = readout_s * self._settling_rates(measured, each)
-        return replace(self._corrected(measured), sensitivities=sensitivities)
+        velocities, current = self._offsets.velocities, measured.frames[1]
+        sigmas, told = velocities.sigmas(current), velocities.measured(current)
+        if sigmas is not None and readout_s != 0.0:
+            sensitivities |= self._by_velocity(measured, sigmas, readout_s)
+        # As extrapolated it tells the readout: what rows tell of it rests on the readout assumed.
+        values = () if told is None else -told.values
+        return replace(
+            self._corrected(measured),
+            sensitivities=sensitivities,
+            expected=dict(zip(_VELOCITIES, values, strict=False)),
+        )
 
     def _sensitivity(self, name: str, measured: Measurements) -> FloatArray:
         """Return the derivatives of corrected measurements by an error of a constant."""
         if name == DISPARITY:
             return np.tile([0.0, 0.0, 1.0], (2, len(measured.matches), 1))
         velocities = [self._offsets.velocities.of(frame) for frame in measured.frames]
+        told = self._offsets.velocities.measured(measured.frames[1])
+        if told is not None and velocities[1] is not None:
+            velocities[1] = velocities[1] - told.sigmas * told.values
         return -self._settling_rates(measured, velocities)
 
     def _settling_rates(

@@ -158,6 +158,71 @@ def descend(
     return None if isinstance(T, Failure) else T
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Adjustment:
+    """A pose and errors of constants, estimated together.
+
+    Parameters
+    ----------
+    T_target_source : ndarray of float64, shape (4, 4)
+    values : ndarray of float64, shape (k,)
+        Errors of the constants, in units of what is known of them.
+    covariance : ndarray of float64, shape (k, k)
+        Of these.
+    effects : ndarray of float64, shape (6, k)
+        Derivative of the pose, left perturbation, by what is taken off for each error.
+    """
+
+    T_target_source: FloatArray
+    values: FloatArray
+    covariance: FloatArray
+    effects: FloatArray
+
+
+def adjust(
+    T_target_source: FloatArray, residuals: StereoResiduals, *, n_iterations: int
+) -> Adjustment | None:
+    """Estimate a pose and the constants of the residuals together; None where it fails.
+
+    Errors of the constants are around zero by a sigma of one, in their units.
+
+    Parameters
+    ----------
+    T_target_source : ndarray of float64, shape (4, 4)
+        Start value.
+    residuals : StereoResiduals
+        Of the matches used.
+    n_iterations : int
+        Of Gauss-Newton steps.
+    """
+    T = T_target_source
+    J_constants, _ = residuals.sensitivities(T, residuals.source_points)
+    k, values = len(J_constants), np.zeros(len(J_constants))
+    H = np.eye(6 + k)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(n_iterations):
+            at = residuals.without(np.einsum("kin,k->in", J_constants, values)).linearize(T)
+            if isinstance(at, Failure):
+                return None
+            rows = np.concatenate([at.J, J_constants])
+            whiten_in_place(at.factors, rows[6:])
+            flat = rows.reshape(6 + k, -1)
+            H, g = flat @ flat.T, flat @ at.r.ravel()
+            H[6:, 6:] += np.eye(k)
+            g[6:] -= values
+            _, step, info = dposv(H, g)
+            if info != 0 or not np.isfinite(step).all():
+                return None
+            T = se3.make_transform(cv2.Rodrigues(step[:3])[0], step[3:6]) @ T
+            values = values + step[6:]
+    return Adjustment(
+        T_target_source=se3.normalize(T),
+        values=values,
+        covariance=np.linalg.inv(H)[6:, 6:],
+        effects=-np.linalg.solve(H[:6, :6], H[:6, 6:]),
+    )
+
+
 def fit_covariance(
     T_target_source: FloatArray,
     matches: Correspondences,
@@ -258,7 +323,8 @@ def estimate_constants(
 ) -> dict[str, ConstantError]:
     """Estimate the errors of constants of the camera, each beside the pose and the others.
 
-    Errors are in units of what is known of them: the others are around zero by a sigma of one.
+    Errors are in units of what is known of them: the others are around what is expected by a sigma
+    of one.
 
     The Jacobian is taken at the points as estimated from both frames. At the points as measured,
     the source's noise would be in the Jacobian and in the residuals alike, and bias the estimate
@@ -302,7 +368,8 @@ def estimate_constants(
     free = np.eye(len(scores))[told]
     known = np.eye(len(scores)) - free[:, np.newaxis] * free[:, :, np.newaxis]
     gains = np.linalg.solve(information + known, free[:, :, np.newaxis])[:, :, 0]
-    values = gains @ np.sum(scores, axis=1)
+    expected = np.array(residuals.expected)
+    values = gains @ np.sum(scores, axis=1) + np.einsum("mi,mij,j->m", gains, known, expected)
     variances = np.einsum("mi,mij,mj->m", gains, scores @ scores.T + known, gains)
     return {
         residuals.constants[k]: ConstantError(

@@ -139,12 +139,15 @@ class StereoResiduals:
         Threshold of the robust kernel, sigmas.
     constants : tuple of str
         Names of the k constants of the camera whose errors are to be estimated.
+    expected : tuple of float
+        What these errors are expected to be.
     """
 
     columns: FloatArray
     camera: StereoCamera
     huber: float
     constants: tuple[str, ...] = ()
+    expected: tuple[float, ...] = ()
 
     @classmethod
     def of(
@@ -166,7 +169,13 @@ class StereoResiduals:
         J = source_jacobian(T, columns[:3], camera)
         J *= matches.source_sigmas.T[:, np.newaxis]
         _write_factors(columns[6:12], J, matches.target_sigmas.T**2)
-        return cls(columns=columns, camera=camera, huber=huber, constants=constants)
+        return cls(
+            columns=columns,
+            camera=camera,
+            huber=huber,
+            constants=constants,
+            expected=tuple(matches.expected.get(name, 0.0) for name in constants),
+        )
 
     @property
     def source_points(self) -> FloatArray:
@@ -202,6 +211,12 @@ class StereoResiduals:
     def select(self, chosen: BoolArray) -> StereoResiduals:
         """Return the residuals of some matches."""
         return replace(self, columns=self.columns.take(np.flatnonzero(chosen), axis=1))
+
+    def without(self, errors: FloatArray) -> StereoResiduals:
+        """Return the residuals after measurements in the target were corrected, shape (3, n)."""
+        columns = self.columns.copy()
+        columns[3:6] -= errors
+        return replace(self, columns=columns)
 
     def sensitivities(
         self, T: FloatArray, source_points: FloatArray
