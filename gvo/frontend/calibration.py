@@ -54,8 +54,10 @@ _VELOCITIES = tuple(f"velocity{axis}" for axis in range(6))
 # and the smallest sigma along an axis, rad/s and m/s.
 _FIRST_CHANGE = 0.2
 _LEAST_CHANGE = 0.01
-# Gauss-Newton steps of a velocity that is measured.
+# Gauss-Newton steps of a velocity that is measured, and the share of the matches that have to agree
+# on it: it is fitted to what is there.
 _N_ITERATIONS = 3
+_MIN_MEASURED_SHARE = 0.5
 # A row offset of the right image, the median of many measurements, that is worth a word.
 _LEAST_ROW_PX = 0.04
 # Stamps nearer to each other than this, in seconds, tell no velocity.
@@ -170,6 +172,8 @@ class MeasuredVelocity:
 
     Parameters
     ----------
+    velocity : ndarray of float64, shape (6,)
+        Twist per second (rad/s, m/s), right of the pose.
     sigmas : ndarray of float64, shape (6,)
         Of the velocity as extrapolated, rad/s and m/s.
     values : ndarray of float64, shape (6,)
@@ -182,11 +186,17 @@ class MeasuredVelocity:
         The step, inverted.
     """
 
+    velocity: FloatArray
     sigmas: FloatArray
     values: FloatArray
     covariance: FloatArray
     effects: FloatArray
     T_target_source: FloatArray
+
+    @property
+    def extrapolated(self) -> FloatArray:
+        """The velocity as it was before, shape (6,)."""
+        return self.velocity - self.sigmas * self.values
 
 
 class FrameVelocities:
@@ -201,7 +211,6 @@ class FrameVelocities:
         self._velocities: WeakKeyDictionary[Stamped, FloatArray] = WeakKeyDictionary()
         self._sigmas: WeakKeyDictionary[Stamped, FloatArray] = WeakKeyDictionary()
         self._measured: WeakKeyDictionary[Stamped, MeasuredVelocity] = WeakKeyDictionary()
-        self._ends: WeakKeyDictionary[Stamped, FloatArray] = WeakKeyDictionary()
         self._starts: WeakKeyDictionary[Stamped, ref[Stamped]] = WeakKeyDictionary()
 
     def expect(
@@ -213,8 +222,8 @@ class FrameVelocities:
         its step and half of its change, which is in doubt, and so did the first frame of all. What
         an earlier step between the two left behind plays no role.
         """
-        elapsed_s = 1e-9 * (current.stamp_ns - reference.stamp_ns)
-        if abs(elapsed_s) < _MIN_ELAPSED_S:
+        elapsed_s = _elapsed_s(reference, current)
+        if elapsed_s is None:
             return
         before = self._steps.get(reference)
         self._measured.pop(current, None)
@@ -224,7 +233,8 @@ class FrameVelocities:
                 self._velocities.pop(observations, None)
                 self._sigmas.pop(observations, None)
             if before is not None:
-                self._velocities[reference] = self._ends.get(reference, before)
+                told = self._measured.get(reference)
+                self._velocities[reference] = before if told is None else told.velocity
             return
         step = se3.log(T_reference_current) / elapsed_s
         self._steps[current] = step
@@ -241,10 +251,15 @@ class FrameVelocities:
         self._sigmas.pop(reference, None)
         self._sigmas[current] = _along_each_axis(step - before)
 
+    def settle(self, reference: Stamped, current: Stamped, T_reference_current: FloatArray) -> None:
+        """Take over a step; the velocities that it was estimated with stay as they are."""
+        elapsed_s = _elapsed_s(reference, current)
+        if elapsed_s is not None:
+            self._steps[current] = se3.log(T_reference_current) / elapsed_s
+
     def measure(self, observations: Stamped, measured: MeasuredVelocity) -> None:
         """Add what the rows of the newest frame tell to its velocity."""
-        velocity = self._velocities[observations] + measured.sigmas * measured.values
-        self._velocities[observations] = self._ends[observations] = velocity
+        self._velocities[observations] = measured.velocity
         self._measured[observations] = measured
 
     def of(self, observations: Stamped) -> FloatArray | None:
@@ -253,9 +268,10 @@ class FrameVelocities:
 
     def copy(self, observations: Stamped, other: Stamped) -> None:
         """Let the same frame in another form have the same velocity."""
-        for each in (self._velocities, self._measured, self._ends):
-            if observations in each:
-                each[other] = each[observations]
+        if observations in self._velocities:
+            self._velocities[other] = self._velocities[observations]
+        if observations in self._measured:
+            self._measured[other] = self._measured[observations]
 
     def sigmas(self, observations: Stamped) -> FloatArray | None:
         """Return the sigmas of the velocity as extrapolated, shape (6,); None where it is known.
@@ -278,7 +294,13 @@ class FrameVelocities:
         measured, velocity = self._measured.get(observations), self.of(observations)
         if measured is None or velocity is None:
             return None
-        return np.asarray(measured.effects @ (velocity - self._ends[observations]))
+        return np.asarray(measured.effects @ (velocity - measured.velocity))
+
+
+def _elapsed_s(reference: Stamped, current: Stamped) -> float | None:
+    """Return the time between two frames, seconds; None where it tells no velocity."""
+    elapsed_s = 1e-9 * (current.stamp_ns - reference.stamp_ns)
+    return elapsed_s if abs(elapsed_s) >= _MIN_ELAPSED_S else None
 
 
 def _along_each_axis(change: FloatArray) -> FloatArray:
@@ -647,9 +669,8 @@ class CalibratedCamera:
         if isinstance(result, Failure):
             return result
         if is_step:
-            velocities.expect(first, second, result.T_reference_current)
-            if told is not None:
-                velocities.measure(second, told)
+            take_over = velocities.expect if told is None else velocities.settle
+            take_over(first, second, result.T_reference_current)
         return check_rows(result, self._camera)
 
     def _register(
@@ -700,8 +721,10 @@ class CalibratedCamera:
         is extrapolated leaves rows some tenths of a pixel from where they belong.
         """
         offsets, current = self._offsets, measured.frames[1]
-        sigmas = offsets.velocities.sigmas(current)
-        if sigmas is None or offsets.readout_s == 0.0:
+        velocity, sigmas = (
+            each(current) for each in (offsets.velocities.of, offsets.velocities.sigmas)
+        )
+        if velocity is None or sigmas is None or offsets.readout_s == 0.0:
             return None
         # The measurements are as unsure as said by the inflated sigmas, relative to the velocity.
         units = sigmas / measured.sigma_factor
@@ -710,7 +733,8 @@ class CalibratedCamera:
             sensitivities=self._by_velocity(measured, units, offsets.readout_s),
         )
         inliers = find_inliers(T[np.newaxis], prepared, self._camera, config.ransac)[0]
-        if np.count_nonzero(inliers) < config.ransac.min_inliers:
+        n_needed = max(config.ransac.min_inliers, _MIN_MEASURED_SHARE * len(inliers))
+        if np.count_nonzero(inliers) < n_needed:
             return None
         residuals = StereoResiduals.of(
             T, prepared, self._camera, huber=config.registration.huber
@@ -719,9 +743,11 @@ class CalibratedCamera:
         if found is None:
             return None
         # The pose of the current frame is the inverse: what is left of one is right of the other.
+        values = found.values / measured.sigma_factor
         return MeasuredVelocity(
+            velocity=velocity + sigmas * values,
             sigmas=sigmas,
-            values=found.values / measured.sigma_factor,
+            values=values,
             covariance=found.covariance,
             effects=-found.effects / units,
             T_target_source=found.T_target_source,
@@ -770,8 +796,8 @@ class CalibratedCamera:
             return np.tile([0.0, 0.0, 1.0], (2, len(measured.matches), 1))
         velocities = [self._offsets.velocities.of(frame) for frame in measured.frames]
         told = self._offsets.velocities.measured(measured.frames[1])
-        if told is not None and velocities[1] is not None:
-            velocities[1] = velocities[1] - told.sigmas * told.values
+        if told is not None:
+            velocities[1] = told.extrapolated
         return -self._settling_rates(measured, velocities)
 
     def _settling_rates(

@@ -218,8 +218,8 @@ def adjust(
     return Adjustment(
         T_target_source=se3.normalize(T),
         values=values,
-        covariance=np.linalg.inv(H)[6:, 6:],
-        effects=-np.linalg.solve(H[:6, :6], H[:6, 6:]),
+        covariance=np.asarray(np.linalg.inv(H)[6:, 6:], dtype=np.float64),
+        effects=-np.asarray(np.linalg.solve(H[:6, :6], H[:6, 6:]), dtype=np.float64),
     )
 
 

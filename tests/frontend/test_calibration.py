@@ -279,13 +279,18 @@ def test_of_an_unknown_step_only_the_one_before_is_known() -> None:
 def test_the_velocity_of_a_frame_is_in_doubt_until_the_next_step_is_known() -> None:
     first, second, third = (Seen(stamp) for stamp in (0, 100_000_000, 200_000_000))
     velocities = FrameVelocities()
-    assert velocities.doubts(first).shape == (0, 6)
+    assert velocities.sigmas(first) is None
     velocities.expect(first, second, se3.exp(STEPS[0]))
-    # It may change along any axis.
-    assert np.linalg.matrix_rank(velocities.doubts(second)) == 6
-    velocities.expect(second, third, se3.exp(STEPS[1]))
-    assert len(velocities.doubts(second)) == 0
-    np.testing.assert_allclose(velocities.doubts(third), 10.0 * (STEPS[1:] - STEPS[:1]))
+    # It may change along any axis, by a fifth; later by as much as it just did.
+    of_step, change = 10.0 * STEPS[0], 10.0 * (STEPS[1] - STEPS[0])
+    for frame, vector in ((second, 0.2 * of_step), (third, change / np.sqrt(3.0))):
+        if frame is third:
+            velocities.expect(second, third, se3.exp(STEPS[1]))
+            assert velocities.sigmas(second) is None
+        turn, shift = np.linalg.norm(vector[:3]), np.linalg.norm(vector[3:])
+        sigmas = velocities.sigmas(frame)
+        assert sigmas is not None
+        np.testing.assert_allclose(sigmas, np.repeat([turn, shift], 3))
 
 
 def test_velocities_are_forgotten_with_their_frames() -> None:

@@ -45,7 +45,7 @@ def test_an_offset_that_is_taken_off_was_in_both_disparities(seed: int) -> None:
         CAMERA,
     )
     assert not np.allclose(measured.source_points, true.source_points, rtol=1e-3)
-    for name in {field.name for field in fields(Correspondences)} - {"sensitivities"}:
+    for name in {field.name for field in fields(Correspondences)} - {"sensitivities", "expected"}:
         found = getattr(measured.without_offset(0.4, CAMERA), name)
         np.testing.assert_allclose(found, getattr(true, name), rtol=1e-9)
     assert measured.without_offset(0.0, CAMERA) is measured
