@@ -105,7 +105,9 @@ def test_the_ablation_leaves_out_what_its_rows_say(benchmark_lines: list[str]) -
     assert rows["as set"] == rows["refined"]
     assert rows["plain Umeyama"] != rows["weighted Umeyama"] != rows["refined"]
     chain = rows["without links to keyframes"]
-    assert chain[:4] == chain[4:] != rows["as set"][4:]
+    assert chain[:4] == chain[4:]
+    # With links smoothing changes the errors; by more than is rounded off where they are large.
+    assert rows["weighted Umeyama"][:4] != rows["weighted Umeyama"][4:]
 
 
 def test_the_ablation_knows_sensor_and_front_end(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from gvo.config import Config
 from gvo.frontend.calibration import (
     ConstantFilter,
     FrameVelocities,
+    MeasuredVelocity,
     RigOffsets,
     VarianceFactor,
     describe_offsets,
@@ -291,6 +292,78 @@ def test_the_velocity_of_a_frame_is_in_doubt_until_the_next_step_is_known() -> N
         sigmas = velocities.sigmas(frame)
         assert sigmas is not None
         np.testing.assert_allclose(sigmas, np.repeat([turn, shift], 3))
+
+
+def test_a_pose_is_off_by_what_is_learnt_of_its_velocity_later() -> None:
+    first, second, third, fourth = (Seen(stamp) for stamp in range(0, 400_000_000, 100_000_000))
+    velocities = FrameVelocities()
+    velocities.expect(first, second, se3.exp(STEPS[0]))
+    velocities.expect(second, third, se3.exp(STEPS[1]))
+    extrapolated, sigmas = velocities.of(third), velocities.sigmas(third)
+    assert extrapolated is not None
+    assert sigmas is not None
+    rng = np.random.default_rng(2)
+    measured = MeasuredVelocity(
+        velocity=extrapolated + sigmas * np.arange(6),
+        sigmas=sigmas,
+        values=np.arange(6.0),
+        covariance=np.eye(6),
+        effects=rng.normal(size=(6, 6)),
+        T_target_source=np.eye(4),
+    )
+    np.testing.assert_allclose(measured.extrapolated, extrapolated, atol=1e-12)
+    velocities.measure(third, measured)
+    assert velocities.measured(third) is measured
+    assert_velocity(velocities, third, measured.velocity)
+    error = velocities.error(third)
+    assert error is not None
+    np.testing.assert_array_equal(error, 0.0)
+    assert velocities.error(second) is None
+    # The step itself changes, what it was estimated with does not.
+    velocities.settle(second, third, se3.exp(2.0 * STEPS[1]))
+    assert_velocity(velocities, third, measured.velocity)
+    velocities.expect(third, fourth, se3.exp(STEPS[0]))
+    mean = 0.5 * (20.0 * STEPS[1] + 10.0 * STEPS[0])
+    assert_velocity(velocities, third, mean)
+    assert velocities.measured(third) is None
+    place = Seen(third.stamp_ns)
+    velocities.copy(third, place)
+    for frame in (third, place):
+        error = velocities.error(frame)
+        assert error is not None
+        np.testing.assert_allclose(error, measured.effects @ (mean - measured.velocity))
+    # Where the next step fails, what was measured is the best that is known.
+    velocities.expect(third, fourth, None)
+    assert_velocity(velocities, third, measured.velocity)
+    # Registered anew it is measured anew.
+    velocities.expect(second, third, se3.exp(STEPS[1]))
+    assert velocities.measured(third) is None
+    assert velocities.error(third) is None
+
+
+def test_rows_tell_the_velocity_of_the_newest_frame() -> None:
+    # Each second frame: between two of them a camera in the hand changes its velocity.
+    recording = gvo.SyntheticRecording("turning", "rgbd", n_frames=27, seed=3, readout_ms=25.0)
+    poses = recording.ground_truth().T_world_frame
+    given = Config.model_validate({"camera": {"readout_ms": 25.0}})
+    frontend: Any = make_frontend(recording.info.camera, given)
+    frames = frames_of(recording)
+    seen = [frontend.extract(frame) for frame in frames[::2]]
+    errors, prior = [], None
+    for n, (reference, current) in enumerate(pairwise(seen[:-1]), start=1):
+        found = frontend.register(reference, current, prior)
+        T = found.T_reference_current
+        prior = MotionPrior(T_predicted=T, T_recent=T)
+        measured = frontend.rig_offsets.velocities.measured(current)
+        assert measured is not None
+        if n > 1:  # of a first step nothing is extrapolated
+            k = 2 * n
+            seconds = 1e-9 * (frames[k + 1].stamp_ns - frames[k - 1].stamp_ns)
+            turn = se3.log(se3.invert(poses[k - 1]) @ poses[k + 1])[:3] / seconds
+            compared = measured.velocity, measured.extrapolated
+            errors.append([np.linalg.norm(each[:3] - turn) for each in compared])
+    by_rows, extrapolated = np.mean(errors, axis=0)
+    assert by_rows < 0.75 * extrapolated
 
 
 def test_velocities_are_forgotten_with_their_frames() -> None:

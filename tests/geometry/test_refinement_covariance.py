@@ -13,7 +13,7 @@ from gvo._trace import Event, watched
 from gvo.config import RegistrationConfig
 from gvo.geometry import se3
 from gvo.geometry.correspondences import Correspondences
-from gvo.geometry.refinement import Refinement, descend, fit_covariance, refine_pose
+from gvo.geometry.refinement import Refinement, adjust, descend, fit_covariance, refine_pose
 from gvo.geometry.residuals import StereoResiduals
 from gvo.types import Failure, FloatArray
 from tests.geometry.scenes import (
@@ -275,3 +275,79 @@ def test_numbers_that_overflow_on_the_way_are_no_warning(is_refined: bool) -> No
         assert isinstance(answer, Failure)
     else:
         assert descend(np.eye(4), residuals, n_iterations=3) is None
+
+
+def with_constants(
+    rng: np.random.Generator, values: FloatArray, noise: float
+) -> tuple[FloatArray, StereoResiduals]:
+    """Return T_target_source, and residuals of matches that errors of constants moved."""
+    T, matches = measure(rng, noise * rng.normal(size=(200, 3)))
+    sensitivities = {f"c{k}": rng.normal(size=(2, 200, 3)) for k in range(len(values))}
+    for value, (_, in_target) in zip(values, sensitivities.values(), strict=True):
+        matches = replace(matches, target_uvd=matches.target_uvd + value * in_target)
+    zero = np.zeros((200, 3))
+    sensitivities = {name: np.stack([zero, each[1]]) for name, each in sensitivities.items()}
+    return T, residuals_of(T, replace(matches, sensitivities=sensitivities))
+
+
+def test_constants_are_estimated_beside_the_pose() -> None:
+    values = np.array([0.6, -1.1, 0.2])
+    T, residuals = with_constants(np.random.default_rng(6), values, noise=0.0)
+    start = se3.exp(np.full(6, 0.01)) @ T
+    found = adjust(start, residuals, n_iterations=6)
+    assert found is not None
+    # Each is around zero by a sigma of one: so many matches outweigh that by far.
+    np.testing.assert_allclose(found.values, values, rtol=0.01)
+    np.testing.assert_allclose(found.T_target_source, T, atol=1e-3)
+
+
+def test_the_covariance_of_constants_is_that_of_their_errors() -> None:
+    squares, rng = [], np.random.default_rng(8)
+    for _ in range(60):
+        values = rng.normal(size=3)
+        T, residuals = with_constants(rng, values, noise=1.0)
+        found = adjust(T, residuals, n_iterations=4)
+        assert found is not None
+        error = found.values - values
+        squares.append(error @ np.linalg.solve(found.covariance, error) / 3.0)
+    assert 0.7 < np.mean(squares) < 1.5
+
+
+def test_effects_tell_how_the_pose_follows_what_is_taken_off() -> None:
+    rng = np.random.default_rng(9)
+    T, residuals = with_constants(rng, np.zeros(2), noise=0.3)
+    found = adjust(T, residuals, n_iterations=8)
+    assert found is not None
+    # Known to be so much, in place of what was estimated.
+    for k in range(2):
+        known = found.values + 0.05 * np.eye(2)[k]
+        errors = np.einsum(
+            "kin,k->in", residuals.sensitivities(T, residuals.source_points)[0], known
+        )
+        moved = descend(found.T_target_source, residuals.without(errors), n_iterations=8)
+        assert moved is not None
+        step = se3.log(moved @ se3.invert(found.T_target_source))
+        expected = 0.05 * found.effects[:, k]
+        np.testing.assert_allclose(step, expected, atol=0.05 * np.abs(expected).max())
+
+
+def test_constants_of_points_behind_the_camera_are_not_estimated() -> None:
+    T, residuals = with_constants(np.random.default_rng(7), np.zeros(1), noise=0.0)
+    behind = se3.make_transform(np.diag([-1.0, 1.0, -1.0]), np.zeros(3)) @ T
+    assert adjust(behind, residuals, n_iterations=2) is None
+
+
+def test_the_others_are_expected_where_they_are_said_to_be() -> None:
+    # Two constants that act alike: what is expected of one is not looked for in the other.
+    rng = np.random.default_rng(10)
+    T, matches = measure(rng, 0.01 * rng.normal(size=(300, 3)))
+    alike = np.stack([np.zeros((300, 3)), rng.normal(size=(300, 3))])
+    matches = replace(matches, target_uvd=matches.target_uvd + 0.5 * alike[1])
+    matches = replace(matches, sensitivities={"first": alike, "second": alike})
+    estimates = []
+    for expected in (0.0, 0.5):
+        told = replace(matches, expected={"second": expected})
+        found = covariance_of(T, told)
+        estimates.append(found.calibration_errors["first"].value)
+    assert estimates[0] - estimates[1] == pytest.approx(0.5, rel=0.02)
+    assert estimates[1] == pytest.approx(0.0, abs=0.02)
