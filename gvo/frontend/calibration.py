@@ -30,7 +30,7 @@ from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.ransac import find_inliers
-from gvo.geometry.refinement import adjust
+from gvo.geometry.refinement import Adjustment, adjust
 from gvo.geometry.residuals import StereoResiduals
 from gvo.types import (
     ConstantError,
@@ -176,27 +176,18 @@ class MeasuredVelocity:
         Twist per second (rad/s, m/s), right of the pose.
     sigmas : ndarray of float64, shape (6,)
         Of the velocity as extrapolated, rad/s and m/s.
-    values : ndarray of float64, shape (6,)
-        By how much it differs from that, in these sigmas.
-    covariance : ndarray of float64, shape (6, 6)
-        Of what is left, in the same.
-    effects : ndarray of float64, shape (6, 6)
-        Derivative of the pose of this frame, right perturbation, by its velocity.
-    T_target_source : ndarray of float64, shape (4, 4)
-        The step, inverted.
+    found : Adjustment
+        The step, and by how much the velocity differs from that, in these sigmas.
     """
 
     velocity: FloatArray
     sigmas: FloatArray
-    values: FloatArray
-    covariance: FloatArray
-    effects: FloatArray
-    T_target_source: FloatArray
+    found: Adjustment
 
     @property
     def extrapolated(self) -> FloatArray:
         """The velocity as it was before, shape (6,)."""
-        return self.velocity - self.sigmas * self.values
+        return self.velocity - self.sigmas * self.found.values
 
 
 class FrameVelocities:
@@ -222,8 +213,8 @@ class FrameVelocities:
         its step and half of its change, which is in doubt, and so did the first frame of all. What
         an earlier step between the two left behind plays no role.
         """
-        elapsed_s = _elapsed_s(reference, current)
-        if elapsed_s is None:
+        elapsed_s = 1e-9 * (current.stamp_ns - reference.stamp_ns)
+        if abs(elapsed_s) < _MIN_ELAPSED_S:
             return
         before = self._steps.get(reference)
         self._measured.pop(current, None)
@@ -250,12 +241,6 @@ class FrameVelocities:
         self._velocities[current] = step + 0.5 * (step - before)
         self._sigmas.pop(reference, None)
         self._sigmas[current] = _along_each_axis(step - before)
-
-    def settle(self, reference: Stamped, current: Stamped, T_reference_current: FloatArray) -> None:
-        """Take over a step; the velocities that it was estimated with stay as they are."""
-        elapsed_s = _elapsed_s(reference, current)
-        if elapsed_s is not None:
-            self._steps[current] = se3.log(T_reference_current) / elapsed_s
 
     def measure(self, observations: Stamped, measured: MeasuredVelocity) -> None:
         """Add what the rows of the newest frame tell to its velocity."""
@@ -294,13 +279,8 @@ class FrameVelocities:
         measured, velocity = self._measured.get(observations), self.of(observations)
         if measured is None or velocity is None:
             return None
-        return np.asarray(measured.effects @ (velocity - measured.velocity))
-
-
-def _elapsed_s(reference: Stamped, current: Stamped) -> float | None:
-    """Return the time between two frames, seconds; None where it tells no velocity."""
-    elapsed_s = 1e-9 * (current.stamp_ns - reference.stamp_ns)
-    return elapsed_s if abs(elapsed_s) >= _MIN_ELAPSED_S else None
+        # The pose is the inverse of the step: what is left of one is right of the other.
+        return -measured.found.effects @ ((velocity - measured.velocity) / measured.sigmas)
 
 
 def _along_each_axis(change: FloatArray) -> FloatArray:
@@ -658,7 +638,8 @@ class CalibratedCamera:
                 velocities.expect(first, second, se3.invert(rough))
                 told = self._measure_velocity(measured, rough, config)
             if told is not None:
-                hints["T_start"] = told.T_target_source
+                hints["T_start"] = told.found.T_target_source
+                velocities.expect(first, second, se3.invert(told.found.T_target_source))
                 velocities.measure(second, told)
         result = self._register(measured, config, hints, is_step=is_step)
         if isinstance(result, Failure) and hints.pop("T_start", None) is not None:
@@ -668,9 +649,8 @@ class CalibratedCamera:
             result = self._register(measured, config, hints, is_step=is_step)
         if isinstance(result, Failure):
             return result
-        if is_step:
-            take_over = velocities.expect if told is None else velocities.settle
-            take_over(first, second, result.T_reference_current)
+        if is_step and told is None:
+            velocities.expect(first, second, result.T_reference_current)
         return check_rows(result, self._camera)
 
     def _register(
@@ -709,7 +689,7 @@ class CalibratedCamera:
         if told is not None:
             axes = [_VELOCITIES.index(name) for name in in_sigmas if name in _VELOCITIES]
             rows = [i for i, name in enumerate(in_sigmas) if name in _VELOCITIES]
-            left[np.ix_(rows, rows)] = told.covariance[np.ix_(axes, axes)]
+            left[np.ix_(rows, rows)] = told.found.covariance[np.ix_(axes, axes)]
         return np.asarray(effects.T @ left @ effects)
 
     def _measure_velocity(
@@ -721,45 +701,32 @@ class CalibratedCamera:
         is extrapolated leaves rows some tenths of a pixel from where they belong.
         """
         offsets, current = self._offsets, measured.frames[1]
-        velocity, sigmas = (
-            each(current) for each in (offsets.velocities.of, offsets.velocities.sigmas)
-        )
+        velocity, sigmas = offsets.velocities.of(current), offsets.velocities.sigmas(current)
         if velocity is None or sigmas is None or offsets.readout_s == 0.0:
             return None
-        # The measurements are as unsure as said by the inflated sigmas, relative to the velocity.
-        units = sigmas / measured.sigma_factor
-        prepared = replace(
-            self._corrected(measured),
-            sensitivities=self._by_velocity(measured, units, offsets.readout_s),
-        )
+        sensitivities = self._by_velocity(measured, sigmas, offsets.readout_s)
+        prepared = replace(self._corrected(measured), sensitivities=sensitivities)
         inliers = find_inliers(T[np.newaxis], prepared, self._camera, config.ransac)[0]
         n_needed = max(config.ransac.min_inliers, _MIN_MEASURED_SHARE * len(inliers))
         if np.count_nonzero(inliers) < n_needed:
             return None
-        residuals = StereoResiduals.of(
-            T, prepared, self._camera, huber=config.registration.huber
-        ).select(inliers)
-        found = adjust(T, residuals, n_iterations=_N_ITERATIONS)
+        huber = config.registration.huber
+        residuals = StereoResiduals.of(T, prepared, self._camera, huber=huber).select(inliers)
+        factor = measured.sigma_factor
+        found = adjust(T, residuals, n_iterations=_N_ITERATIONS, sigma_factor=factor)
         if found is None:
             return None
-        # The pose of the current frame is the inverse: what is left of one is right of the other.
-        values = found.values / measured.sigma_factor
         return MeasuredVelocity(
-            velocity=velocity + sigmas * values,
-            sigmas=sigmas,
-            values=values,
-            covariance=found.covariance,
-            effects=-found.effects / units,
-            T_target_source=found.T_target_source,
+            velocity=velocity + sigmas * found.values, sigmas=sigmas, found=found
         )
 
     def _by_velocity(
-        self, measured: Measurements, units: FloatArray, readout_s: float
+        self, measured: Measurements, sigmas: FloatArray, readout_s: float
     ) -> dict[str, FloatArray]:
         """Return the derivatives of corrected measurements by errors of the current velocity."""
         return {
-            name: -readout_s * self._settling_rates(measured, (None, unit))
-            for name, unit in zip(_VELOCITIES, np.diag(units), strict=True)
+            name: -readout_s * self._settling_rates(measured, (None, sigma))
+            for name, sigma in zip(_VELOCITIES, np.diag(sigmas), strict=True)
         }
 
     def _corrected(self, measured: Measurements) -> Correspondences:
@@ -783,12 +750,9 @@ class CalibratedCamera:
         if sigmas is not None and readout_s != 0.0:
             sensitivities |= self._by_velocity(measured, sigmas, readout_s)
         # As extrapolated it tells the readout: what rows tell of it rests on the readout assumed.
-        values = () if told is None else -told.values
-        return replace(
-            self._corrected(measured),
-            sensitivities=sensitivities,
-            expected=dict(zip(_VELOCITIES, values, strict=False)),
-        )
+        expected = {} if told is None else dict(zip(_VELOCITIES, -told.found.values, strict=True))
+        corrected = self._corrected(measured)
+        return replace(corrected, sensitivities=sensitivities, expected=expected)
 
     def _sensitivity(self, name: str, measured: Measurements) -> FloatArray:
         """Return the derivatives of corrected measurements by an error of a constant."""

@@ -180,7 +180,11 @@ class Adjustment:
 
 
 def adjust(
-    T_target_source: FloatArray, residuals: StereoResiduals, *, n_iterations: int
+    T_target_source: FloatArray,
+    residuals: StereoResiduals,
+    *,
+    n_iterations: int,
+    sigma_factor: float = 1.0,
 ) -> Adjustment | None:
     """Estimate a pose and the constants of the residuals together; None where it fails.
 
@@ -194,11 +198,13 @@ def adjust(
         Of the matches used.
     n_iterations : int
         Of Gauss-Newton steps.
+    sigma_factor : float
+        Inflation of the matches' sigmas, relative to what is known of the constants.
     """
     T = T_target_source
     J_constants, _ = residuals.sensitivities(T, residuals.source_points)
-    k, values = len(J_constants), np.zeros(len(J_constants))
-    H = np.eye(6 + k)
+    k, weight = len(J_constants), sigma_factor**2
+    values, H = np.zeros(k), np.eye(6 + k)
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(n_iterations):
             at = residuals.without(np.einsum("kin,k->in", J_constants, values)).linearize(T)
@@ -208,8 +214,8 @@ def adjust(
             whiten_in_place(at.factors, rows[6:])
             flat = rows.reshape(6 + k, -1)
             H, g = flat @ flat.T, flat @ at.r.ravel()
-            H[6:, 6:] += np.eye(k)
-            g[6:] -= values
+            H[6:, 6:] += weight * np.eye(k)
+            g[6:] -= weight * values
             _, step, info = dposv(H, g)
             if info != 0 or not np.isfinite(step).all():
                 return None
@@ -218,7 +224,7 @@ def adjust(
     return Adjustment(
         T_target_source=se3.normalize(T),
         values=values,
-        covariance=np.asarray(np.linalg.inv(H)[6:, 6:], dtype=np.float64),
+        covariance=weight * np.asarray(np.linalg.inv(H)[6:, 6:], dtype=np.float64),
         effects=-np.asarray(np.linalg.solve(H[:6, :6], H[:6, 6:]), dtype=np.float64),
     )
 

@@ -169,13 +169,9 @@ class StereoResiduals:
         J = source_jacobian(T, columns[:3], camera)
         J *= matches.source_sigmas.T[:, np.newaxis]
         _write_factors(columns[6:12], J, matches.target_sigmas.T**2)
-        return cls(
-            columns=columns,
-            camera=camera,
-            huber=huber,
-            constants=constants,
-            expected=tuple(matches.expected.get(name, 0.0) for name in constants),
-        )
+        expected = tuple(matches.expected.get(name, 0.0) for name in constants)
+        names = {"constants": constants, "expected": expected}
+        return cls(columns=columns, camera=camera, huber=huber, **names)
 
     @property
     def source_points(self) -> FloatArray:
