@@ -239,7 +239,7 @@ class KltFrontend:
         found = MotionPrior(T_predicted=rough.T_reference_current)
         result = self._register_step(found, reference, current, "near")
         # Nothing predicted it: what else it predicts must be there too.
-        return check_view(result, reference.points_cam, self.camera)
+        return self._check_view(result, reference, self._grid(reference), current.frame)
 
     def align_depth(
         self, reference: KltObservations, current: KltObservations, T_reference_current: FloatArray
@@ -307,14 +307,32 @@ class KltFrontend:
         prior = MotionPrior(T_predicted=rough.T_reference_current)
         expected = self._predict(prior.T_predicted, reference, observations)
         result = self._register_link(prior, reference, observations, expected, "aligned")
-        checked = check_view(result, reference.points_cam, self.camera)
         points, frame = reference.depth_points, observations.frame
+        checked = self._check_view(result, reference, points, frame)
+        if isinstance(checked, Failure) or points is None or not isinstance(frame, RgbdFrame):
+            return checked
+        depths = points.astype(np.float64), frame.depth, self.camera, self._config.depth
+        return check_depths(checked, *depths)
+
+    def _check_view(
+        self,
+        result: RelativePose | Failure,
+        reference: _Reference,
+        points: NDArray[np.floating] | None,
+        frame: Frame,
+    ) -> RelativePose | Failure:
+        """Refuse a motion that too few points in view confirm, or depth images for them."""
+        checked = check_view(result, reference.points_cam, self.camera)
         if isinstance(result, Failure) or points is None or not isinstance(frame, RgbdFrame):
             return checked
         depths = points.astype(np.float64), frame.depth, self.camera, self._config.depth
         if isinstance(checked, Failure) and is_seen_again(result, *depths):
-            checked = check_view(result, reference.points_cam, self.camera, depths_agree=True)
-        return checked if isinstance(checked, Failure) else check_depths(checked, *depths)
+            return check_view(result, reference.points_cam, self.camera, depths_agree=True)
+        return checked
+
+    def _grid(self, observations: KltObservations) -> FloatArray | None:
+        frame = observations.frame
+        return self._depths.grid(frame) if isinstance(frame, RgbdFrame) else None
 
     def _register_places(self, reference: KltPlace, current: KltPlace) -> RelativePose | Failure:
         """Register by descriptors, which match corners that moved too far for a track."""
@@ -340,11 +358,10 @@ class KltFrontend:
         self, reference: KltObservations, current: KltObservations, result: RelativePose
     ) -> RelativePose | Failure:
         """Refuse a motion that the depth images of an RGB-D camera contradict."""
-        first, second = reference.frame, current.frame
-        if isinstance(first, RgbdFrame) and isinstance(second, RgbdFrame):
-            points = self._depths.grid(first)
-            return check_depths(result, points, second.depth, self.camera, self._config.depth)
-        return result
+        points, frame = self._grid(reference), current.frame
+        if points is None or not isinstance(frame, RgbdFrame):
+            return result
+        return check_depths(result, points, frame.depth, self.camera, self._config.depth)
 
     def _register_step(
         self,
@@ -595,6 +612,9 @@ class _Reference(Protocol):
 
     @property
     def slopes(self) -> NDArray[np.floating]: ...
+
+    @property
+    def points_cam(self) -> FloatArray: ...
 
     @property
     def templates(self) -> Templates: ...
