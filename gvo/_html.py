@@ -86,9 +86,7 @@ def metres(value: float) -> str:
         return "unknown"
     if abs(value) >= 1000.0:
         return f"{value / 1000.0:,.3f} km" if abs(value) < 1e9 else f"{value:.3g} m"
-    if abs(value) >= 1.0:
-        return f"{value:.2f} m"
-    return f"{1000.0 * value:.3g} mm"
+    return f"{value:.2f} m" if abs(value) >= 1.0 else f"{1000.0 * value:.3g} mm"
 
 
 def vector(values: Sequence[float] | _FloatArray, sigmas: Sequence[float] | _FloatArray) -> str:

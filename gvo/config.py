@@ -471,10 +471,8 @@ def _read_yaml(path: Path) -> dict[str, dict[str, object]]:
             raise ConfigurationError(
                 f"{path}: {cut(str(section), MAX_SHOWN)} must hold keys, see `gvo config --all`"
             )
-    try:
+    with named_faults(ConfigurationError, path, others=(ConfigurationError,)):
         validate_configuration(content)
-    except ConfigurationError as error:
-        raise ConfigurationError(f"{path}: {error}") from error
     return content
 
 

@@ -350,10 +350,7 @@ class LocalGraph:
         while before in self._references:
             before_last.add(before)
             before = self._references[before]
-        none, (T_origin_last, _) = (
-            np.zeros((6, 6)),
-            self._poses.get(last, self._poses[self._origin]),
-        )
+        T_origin_last, none = self._poses.get(last, self._poses[self._origin])[0], np.zeros((6, 6))
         found = {}
         for frame_id in self._keys:
             T, covariance = self._poses[frame_id]

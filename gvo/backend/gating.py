@@ -22,7 +22,7 @@ from gvo.backend.factors import ORIGIN, Measurement, find_faults, prior_fault
 from gvo.backend.motion_model import ConstantVelocity
 from gvo.backend.window_graph import NewPose, WindowGraph
 from gvo.geometry import se3
-from gvo.types import BoolArray, Edge, FloatArray, FrameId, IntArray, PosePrior, Prior, Rejected
+from gvo.types import Edge, FloatArray, FrameId, IntArray, PosePrior, Prior, Rejected
 
 _Item = TypeVar("_Item")
 
@@ -110,7 +110,8 @@ def gate_edges(
         covariances = list(compress(covariances, is_left))
         twists = _twists(predictions)
         distances = _distances(twists, covariances)
-    is_near = _are_near_medoid(distances).tolist()
+    medoid = int(np.minimum(distances, _AGREEMENT).sum(axis=1).argmin())
+    is_near = (distances[medoid] <= _AGREEMENT).tolist()
     mean, spread = _mean(list(compress(twists, is_near)), list(compress(informations, is_near)))
     return GateResult(
         T_world_start=predictions[0].retract(mean),
@@ -183,12 +184,6 @@ def _true_distances(
         total = edges[i].covariance + edges[j].covariance + spread
         distances[i, j] = _mahalanobis(difference, total)
     return distances + distances.T
-
-
-def _are_near_medoid(distances: FloatArray) -> BoolArray:
-    """Return a mask, shape (n,), of the predictions that agree with their medoid."""
-    medoid = int(np.minimum(distances, _AGREEMENT).sum(axis=1).argmin())
-    return np.asarray(distances[medoid] <= _AGREEMENT)
 
 
 def _mean(

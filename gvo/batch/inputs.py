@@ -257,8 +257,7 @@ def name_variants(
         raise ConfigurationError("expected at least one configuration")
     if isinstance(configs, Mapping):
         return _variants(configs.items())
-    texts = map(_text_of, differences(configs))
-    return _variants(zip(texts, configs, strict=True))
+    return _variants(zip(map(_text_of, differences(configs)), configs, strict=True))
 
 
 def _variants(named: Iterable[tuple[str, Config]]) -> list[Variant]:

@@ -35,6 +35,8 @@ _KINDS = (*_NETWORKS, "camera", "-")
 _Sensor = Literal["stereo", "rgbd"]
 _Qos = Literal["sensor", "reliable", "system"]
 
+_say = partial(say, err=True)
+
 
 def live(
     camera: Annotated[
@@ -215,10 +217,6 @@ def _own_camera(
     return StandardInput(sys.stdin.buffer, rig.info, config, depth_scale=rig.depth_scale)
 
 
-def _say(line: str) -> None:
-    say(line, err=True)
-
-
 def _status(odometry: LiveOdometry) -> Callable[[Progress], None]:
     """Return a callback that says every few seconds how it goes."""
     said_s = started_s = time.monotonic()
@@ -230,6 +228,6 @@ def _status(odometry: LiveOdometry) -> Callable[[Progress], None]:
             said_s = now_s
             counts = f"{progress.n_done} frames, {progress.n_tracked} tracked"
             rate = progress.n_done / (now_s - started_s)
-            say(f"{counts}, {odometry.n_dropped} dropped, {rate:.1f} Hz", err=True)
+            _say(f"{counts}, {odometry.n_dropped} dropped, {rate:.1f} Hz")
 
     return show

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-from gvo.errors import ConfigurationError, RecordingError
+from gvo.errors import ConfigurationError, RecordingError, named_faults
 from gvo.io.sync import Paired
 from gvo.types import FaultyFrame
 
@@ -93,10 +93,8 @@ def make_excerpt(start_s: float, duration_s: float | None, every: int) -> Excerp
     ConfigurationError
         Where a number is out of its range.
     """
-    try:
+    with named_faults(ConfigurationError, "--start, --duration, --every", others=(ValueError,)):
         return Excerpt(start_s=start_s, duration_s=duration_s, every=every)
-    except ValueError as error:
-        raise ConfigurationError(f"--start, --duration, --every: {error}") from error
 
 
 def take_excerpt(items: Iterable[Paired], excerpt: Excerpt) -> Iterator[Paired]:

@@ -290,10 +290,8 @@ def _repeated(last: Frame | None, frame: Frame, names: tuple[str, str]) -> str:
     """Name the first stream that shows the same as before; empty where none does."""
     if last is None:
         return ""
-    for name, before, now in zip(names, _images(last), _images(frame), strict=False):
-        if _is_same(before, now):
-            return name
-    return ""
+    pairs = zip(names, _images(last), _images(frame), strict=False)
+    return next((name for name, before, now in pairs if _is_same(before, now)), "")
 
 
 def _images(frame: Frame) -> tuple[ImageArray, ...]:
@@ -301,10 +299,8 @@ def _images(frame: Frame) -> tuple[ImageArray, ...]:
 
 
 def _is_same(first: ImageArray, second: ImageArray) -> bool:
-    # a few rows mostly tell
-    if not np.array_equal(first[::_ROW_STEP], second[::_ROW_STEP]):
-        return False
-    return np.array_equal(first, second) and bool(np.any(first != first[0, 0]))
+    is_alike = np.array_equal(first[::_ROW_STEP], second[::_ROW_STEP])  # a few rows mostly tell
+    return is_alike and np.array_equal(first, second) and bool(np.any(first != first[0, 0]))
 
 
 def make_preparers(info: RecordingInfo) -> _Preparers:

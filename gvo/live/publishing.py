@@ -153,8 +153,7 @@ class Arrivals(AbstractContextManager["Arrivals"]):
     def watch(self, images: Iterable[StampedImage]) -> Iterator[StampedImage]:
         """Yield the images, and note when each came."""
         for image in images:
-            now_s = time.monotonic()
-            self._times_s[image.stream].append(now_s)
+            self._times_s[image.stream].append(time.monotonic())
             self._newest_ns = max(self._newest_ns, image.stamp_ns)
             yield image
 

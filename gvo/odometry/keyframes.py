@@ -102,8 +102,7 @@ class Keyframes(Generic[ObservationsT]):
         self, stamp_ns: int, T_frame_keyframe: FloatArray, n_steps: int, *, is_linked: bool
     ) -> None:
         """Remember from where a keyframe was registered, or could not be."""
-        attempt = _Attempt(T_frame_keyframe=T_frame_keyframe, is_linked=is_linked)
-        self._attempts[stamp_ns] = attempt
+        self._attempts[stamp_ns] = _Attempt(T_frame_keyframe=T_frame_keyframe, is_linked=is_linked)
         # A quarter of the steps before an attempt in vain counts again.
         before = n_steps if is_linked else self._asked_at[stamp_ns]
         self._asked_at[stamp_ns] = (before + 3 * n_steps) // 4

@@ -194,7 +194,9 @@ class LoopDetector:
         asked of `allows` too: how far the camera may have come in the dark.
         """
         if world != self._world:
-            self._leave_world()
+            self.loops.settle()
+            while self._recent:  # odometry does not know where they are any more
+                self._keep_oldest_recent()
         self._world = world
         is_search = self._is_search(world, T_world_frame)
         is_place = is_keyframe and not self._shows_latest(T_world_frame)
@@ -222,12 +224,6 @@ class LoopDetector:
         self._visits[place.stamp_ns] = visit
         self._recent.append(visit)
         if len(self._recent) > _N_RECENT:
-            self._keep_oldest_recent()
-
-    def _leave_world(self) -> None:
-        """Add all places to the index: odometry does not know where they are any more."""
-        self.loops.settle()
-        while self._recent:
             self._keep_oldest_recent()
 
     def _is_search(self, world: int, T_world_frame: FloatArray) -> bool:
@@ -370,9 +366,8 @@ class LoopDetector:
 
     def _agree(self, first: Loop, second: Loop) -> bool:
         """Tell whether two loops and the odometry between their ends agree."""
-        if self._worlds_of(first)[1] != self._worlds_of(second)[1]:
-            return False
-        if _AMBIGUOUS in (first.reason, second.reason):
+        is_apart = self._worlds_of(first)[1] != self._worlds_of(second)[1]
+        if is_apart or _AMBIGUOUS in (first.reason, second.reason):
             return False
         T_first_second, drift = self._way(first.stamp_ns, second.stamp_ns)
         T_references, other_drift = self._way(first.reference_ns, second.reference_ns)

@@ -382,7 +382,8 @@ class Odometry:
         self._keyframes.note_attempt(stamp_ns, T_frame_keyframe, step.n_steps, is_linked=is_linked)
         if isinstance(result, Failure):
             return None
-        link = self._edge_of(stamp_ns, result)
+        T, covariance = result.T_reference_current, result.covariance
+        link = Edge(reference_id=stamp_ns, T_reference_frame=T, covariance=covariance)
         self._note_misclosure(link, step)
         return link
 
@@ -403,13 +404,6 @@ class Odometry:
         factor = offsets.chain_factor
         scaled = replace(link, covariance=factor.value * link.covariance)
         factor.note(factor.value * misclosure(scaled, start, step.estimate))
-
-    def _edge_of(self, stamp_ns: int, result: RelativePose) -> Edge:
-        return Edge(
-            reference_id=stamp_ns,
-            T_reference_frame=result.T_reference_current,
-            covariance=result.covariance,
-        )
 
     def _align_depths(self, observations: _Observations, offered: list[_Offer]) -> list[_Offer]:
         """Return what depth alone measured beside links, where colour contradicts it."""

@@ -171,7 +171,7 @@ def _first_images(source: Source) -> Iterator[tuple[str, str]]:
     """Yield the stream of the first image of each, its stamp and a digest of its pixels."""
     streams: set[int] = set()
     try:
-        with closing(_as_generator(source)) as images:
+        with closing(image for image in source.images()) as images:
             for image in islice(images, _N_FIRST):
                 if image.stream not in streams:
                     streams.add(image.stream)
@@ -180,10 +180,6 @@ def _first_images(source: Source) -> Iterator[tuple[str, str]]:
                     return
     except GvoError:
         return  # whoever reads on is told
-
-
-def _as_generator(source: Source) -> Any:  # noqa: ANN401 - what can be closed before its end
-    yield from source.images()
 
 
 def _describe_image(image: StampedImage) -> str:

@@ -308,9 +308,8 @@ def _without_anything(first: Stamped, last: Stamped, blank: Stamped | None) -> l
         for name, array in arrays.items()
         if name != "depth"
     }
-    for n, content in enumerate((uniform | unknown, strange)):
-        frames.append(replace(first, stamp_ns=last.stamp_ns + 1 + n, **content))
-    return frames
+    contents = enumerate((uniform | unknown, strange), start=1)
+    return frames + [replace(first, stamp_ns=last.stamp_ns + n, **each) for n, each in contents]
 
 
 def _images_of(frame: StereoFrame | RgbdFrame) -> dict[str, Any]:

@@ -165,8 +165,7 @@ class DepthScale:
 
     def ticks(self) -> list[float]:
         """Return round depths within the scale, metres."""
-        decades = range(-3, 5)
-        candidates = [digit * 10.0**n for n in decades for digit in (1, 2, 5)]
+        candidates = [digit * 10.0**n for n in range(-3, 5) for digit in (1, 2, 5)]
         return [depth for depth in candidates if self.near_m <= depth <= self.far_m]
 
 

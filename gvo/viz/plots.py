@@ -337,8 +337,7 @@ def add_legend(
     **place: Any,  # noqa: ANN401 - options of matplotlib
 ) -> None:
     """Add a frameless legend of so many rows to a figure."""
-    n_columns = math.ceil(len(labels) / n_rows)
-    figure.legend(handles, labels, ncols=n_columns, frameon=False, **place)
+    figure.legend(handles, labels, ncols=math.ceil(len(labels) / n_rows), frameon=False, **place)
 
 
 def gaps_before(seconds: FloatArray) -> IntArray:

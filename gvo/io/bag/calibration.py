@@ -171,10 +171,8 @@ def _stereo_pair(
             f"nor from tf: {found.reason}; give --calibration FILE of the pair"
         )
     origin = f"{where}: {found.origin}"
-    if left.is_rectified:
-        pair = pair_of_baseline((left, right), found.T_target_source, origin)
-    else:
-        pair = pair_of_extrinsics((left, right), found.T_target_source, origin)
+    make_pair = pair_of_baseline if left.is_rectified else pair_of_extrinsics
+    pair = make_pair((left, right), found.T_target_source, origin)
     baseline = stereo_baseline(pair, origin)
     return pair, f"baseline: {baseline:.4f} m from {found.origin}"
 
@@ -338,9 +336,7 @@ def _of_realsense(
     if not common:
         return Failure(reason="the CameraInfo name no frame")
     names = [f"{stream[1]}/tf/{common[0]}" for stream in streams if stream is not None]
-    T_stream_reference = {}
-    for message in reader.messages(names):
-        T_stream_reference[message.topic.name] = _transform(message)
+    T_stream_reference = {m.topic.name: _transform(m) for m in reader.messages(names)}
     if len(T_stream_reference) != len(set(names)):
         return Failure(reason=f"{names[0]} or {names[1]} yields no message")
     T_target_reference, T_source_reference = (T_stream_reference[name] for name in names)

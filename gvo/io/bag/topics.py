@@ -167,10 +167,7 @@ def find_camera_info(image: Topic, topics: Iterable[Topic]) -> str | None:
         for topic in topics
         if topic.type == CAMERA_INFO_TYPE and topic.n_messages > 0
     }
-    for base in camera_info_names(image):
-        if base in names:
-            return names[base]
-    return None
+    return next((names[base] for base in camera_info_names(image) if base in names), None)
 
 
 def camera_info_names(image: Topic) -> list[str]:

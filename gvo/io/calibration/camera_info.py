@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from gvo._text import MAX_SHOWN, cut, shortened
-from gvo.errors import CalibrationError
+from gvo.errors import CalibrationError, named_faults
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration, rectify_stereo, stereo_camera
 from gvo.geometry.lens import N_COEFFICIENTS, DistortionModel
@@ -212,10 +212,8 @@ def check_camera(calibration: Calibration, where: str) -> None:
             f"{where}: the image size must be at most {MAX_SIDE_PX} px a side and "
             f"{MAX_PIXELS // 10**6} megapixels, got {width}x{height}; mend the calibration"
         )
-    try:
+    with named_faults(CalibrationError, where, others=(CalibrationError,)):
         calibration.pinhole()
-    except CalibrationError as error:
-        raise CalibrationError(f"{where}: {error}") from error
 
 
 def _matrices(fields: CameraFields) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -354,10 +352,8 @@ def stereo_baseline(calibrations: tuple[Calibration, Calibration], where: str) -
             "fourth number of P of the right camera, or the transform between the cameras (tf, "
             "T_cn_cnm1, T_BS); give --calibration FILE that holds either"
         )
-    try:
+    with named_faults(CalibrationError, where, others=(CalibrationError,)):
         return stereo_camera(left, right).baseline
-    except CalibrationError as error:
-        raise CalibrationError(f"{where}: {error}") from error
 
 
 def pair_of_extrinsics(
@@ -390,10 +386,8 @@ def pair_of_extrinsics(
         baseline = float(T_left_right[0, 3])
         pair = _without_lens(left, left.K, 0.0), _without_lens(right, left.K, baseline)
     else:
-        try:
+        with named_faults(CalibrationError, where, others=(CalibrationError,)):
             pair = rectify_stereo(left, right, T_left_right)
-        except CalibrationError as error:
-            raise CalibrationError(f"{where}: {error}") from error
     for calibration in pair:
         check_camera(calibration, where)
     return pair

@@ -82,10 +82,8 @@ class KittiSource(FolderSource):
             When it does not have a row per row of `times.txt`.
         """
         official = self._folder.resolve().parents[1] / "poses" / f"{self.info.name}.txt"
-        for path in (self._folder / "poses.txt", official):
-            if path.is_file():
-                return self._read_truth(path)
-        return None
+        files = filter(Path.is_file, (self._folder / "poses.txt", official))
+        return next(map(self._read_truth, files), None)
 
     def _read_truth(self, path: Path) -> Trajectory:
         T_world_cam0 = read_trajectory(path).T_world_frame

@@ -402,10 +402,7 @@ def _short_names(texts: Sequence[str], names: Sequence[str]) -> list[str]:
         name if names.count(name) == 1 else f"{Path(text).parent.name}/{name}"
         for text, name in zip(texts, names, strict=True)
     ]
-    if len(set(longer)) == len(longer):
-        return longer
-    return (
-        list(texts)
-        if len(set(texts)) == len(texts)
-        else [f"{number}: {text}" for number, text in enumerate(texts, 1)]
-    )
+    for found in (longer, list(texts)):
+        if len(set(found)) == len(found):
+            return found
+    return [f"{number}: {text}" for number, text in enumerate(texts, 1)]

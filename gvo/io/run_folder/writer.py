@@ -227,7 +227,9 @@ class RunFolder(AbstractContextManager["RunFolder"]):
         row = [getattr(result, name) for name in FRAMES_HEADER]
         self.add_poses(result.raw, result.causal, row)
         self._write("edges.csv", "".join(map(_csv_line, _link_rows(result))))
-        self._write("timings.csv", _csv_line((result.stamp_ns, *_times(result))))
+        times_ms = map(result.stage_ms.get, _STAGES)
+        times = ("" if time_ms is None else f"{time_ms:.3f}" for time_ms in times_ms)
+        self._write("timings.csv", _csv_line((result.stamp_ns, *times)))
         self.add_smoothed(result.finished)
 
     def add_poses(self, raw: Estimate, causal: Estimate, row: Sequence[object]) -> None:
@@ -366,12 +368,6 @@ def _loop_rows(optimum: Optimum) -> Iterator[Sequence[object]]:
             *(f"{value:.9g}" for value in pose),
             *(f"{residual:.4g}", 0 if loop.reason else 1, loop.reason),
         )
-
-
-def _times(result: FrameResult) -> Iterator[str]:
-    for stage in _STAGES:
-        elapsed_ms = result.stage_ms.get(stage)
-        yield "" if elapsed_ms is None else f"{elapsed_ms:.3f}"
 
 
 def _sort_lines(path: Path, *, n_header: int) -> None:

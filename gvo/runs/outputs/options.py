@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from gvo.errors import ConfigurationError, RecordingError, write_faults
+from gvo.errors import ConfigurationError, RecordingError, named_faults, write_faults
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import Source
 from gvo.io.run_folder.line_file import check_folder, check_new
@@ -144,9 +144,7 @@ def name_frames(
     make = partial(RunFrames, world=world, camera=source.info.frame_id, is_robot=is_robot)
     fixed = base_frame.fixed_mount
     mount = base_frame.T_base_cam if fixed is None else fixed
-    try:
+    with named_faults(ConfigurationError, f"--world {world}", others=(ValueError,)):
         if base_frame.is_camera:
             return make(is_world_optical=not is_placed)
         return make(base=base_frame.name, T_base_cam=mount)
-    except ValueError as error:
-        raise ConfigurationError(f"--world {world}: {error}") from error

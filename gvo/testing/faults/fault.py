@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from gvo.geometry.camera import Calibration
 from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import FloatArray
 
 Pixels: TypeAlias = NDArray[Any]
 Kind: TypeAlias = Literal["image", "depth"]
@@ -96,11 +95,11 @@ class Fault:
     def applies_to(self, image: FaultyImage) -> bool:
         """Tell whether an image is affected."""
         since = image.frame - self.first
-        if image.given.stream not in self.streams or since < 0:
+        is_over = self.end is not None and image.frame >= self.end
+        if image.given.stream not in self.streams or since < 0 or is_over:
             return False
-        if self.end is not None and image.frame >= self.end:
-            return False
-        return since % self.every < self.burst and self._is_chosen(image.frame)
+        chance = np.random.default_rng([self.seed, image.frame]).random()
+        return since % self.every < self.burst and chance < self.share
 
     def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
         """Yield the images with the fault.
@@ -121,11 +120,6 @@ class Fault:
     def rng(self, image: FaultyImage) -> np.random.Generator:
         """Return the random generator of one image."""
         return np.random.default_rng([self.seed, image.frame, image.given.stream])
-
-    def _is_chosen(self, frame: int) -> bool:
-        if self.share >= 1.0:
-            return True
-        return bool(np.random.default_rng([self.seed, frame]).random() < self.share)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -295,8 +289,9 @@ class WrongFocalLength(CalibrationFault):
 
     def miscalibrate(self, calibration: Calibration) -> Calibration:
         """Return the calibration with fx, fy and fx * baseline multiplied."""
-        scaling = np.diag([self.factor, self.factor, 1.0])
-        K, P = (_with_focal(matrix, scaling) for matrix in (calibration.K, calibration.P))
+        K, P = calibration.K.copy(), calibration.P.copy()
+        K[:2, :2] *= self.factor
+        P[:2, [0, 1, 3]] *= self.factor
         return replace(calibration, K=K, P=P)
 
 
@@ -319,10 +314,3 @@ class WrongPrincipalPoint(CalibrationFault):
         K[:2, 2] += shift
         P[:2, 2] += shift
         return replace(calibration, K=K, P=P)
-
-
-def _with_focal(matrix: FloatArray, scaling: FloatArray) -> FloatArray:
-    """Scale all but the principal point."""
-    scaled = scaling @ matrix
-    scaled[:2, 2] = matrix[:2, 2]
-    return np.asarray(scaled, dtype=np.float64)

@@ -225,7 +225,6 @@ def scene_json(lines: Sequence[Line], world: World) -> str:
 
 
 def _pieces(points: FloatArray, n_decimals: int) -> list[list[list[float]]]:
-    gaps = np.flatnonzero(np.isnan(points[:, 0]))
-    pieces = np.split(points, gaps)
+    pieces = np.split(points, np.flatnonzero(np.isnan(points[:, 0])))
     solid = [piece[np.isfinite(piece[:, 0])] for piece in pieces]
     return [np.round(piece, n_decimals).tolist() for piece in solid if len(piece) > 0]

@@ -152,12 +152,7 @@ def _drift_figure(found: Sequence[tuple[str, Drift | None]]) -> Figure:
     styles = styles_of(name for name, _ in found)
     for (name, item), style, marker in zip(found, styles, cycle("osD^vP*X"), strict=False):
         if item is not None:
-            looks = {
-                "color": style.color,
-                "linestyle": style.linestyle,
-                "marker": marker,
-                "ms": 4.5,
-            }
+            looks = {"color": style.color, "ls": style.linestyle, "marker": marker, "ms": 4.5}
             panels[0].plot(item.lengths_m, item.translations_pct, label=plain(name), **looks)
             panels[1].plot(item.lengths_m, item.rotations_deg_per_m, **looks)
     panels[0].set(xlabel="length of segment [m]", ylabel="translation error [%]")

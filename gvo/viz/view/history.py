@@ -261,8 +261,7 @@ class History:
         if known:
             poses[np.searchsorted(stamps_ns, known)] = [window[stamp_ns] for stamp_ns in known]
         is_final = self._finishing.rows[:, 0] <= self.shown
-        final_ns = self._finishing.rows[is_final, 1]
-        rows = np.searchsorted(stamps_ns, final_ns)
+        rows = np.searchsorted(stamps_ns, self._finishing.rows[is_final, 1])
         poses[rows] = self._finished.rows[is_final].reshape(-1, 4, 4)
         return stamps_ns, poses
 

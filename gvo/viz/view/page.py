@@ -95,7 +95,10 @@ class Page:
             self.playback.show(frame.index)
             self.numbers.content = panels.numbers_html(self._rows(frame))
             self._show_state()
-            self._draw_images(frame)
+            self._overlay.image = _rgb(frame.overlay)
+            self.scene.show_image(_rgb(frame.image))
+            self.scene.show_points(*frame.cloud)
+            self.scene.show_pose(frame.T_world_frame)
             self._draw_paths()
             self._draw_window(frame)
             self._view.show_pose(frame.T_world_frame)
@@ -188,12 +191,6 @@ class Page:
         self.scene.show_ground(ground, panels.grid_cell(0.1 * depth))
         self._view.look_along(frame.T_world_frame, _VIEW_SHARE * depth)
 
-    def _draw_images(self, frame: FrameView) -> None:
-        self._overlay.image = _rgb(frame.overlay)
-        self.scene.show_image(_rgb(frame.image))
-        self.scene.show_points(*frame.cloud)
-        self.scene.show_pose(frame.T_world_frame)
-
     def _draw_paths(self) -> None:
         paths = {name: self._player.history.path(name) for name in ("raw", "causal", "smoothed")}
         for name, (_, positions) in paths.items():
@@ -212,10 +209,7 @@ class Page:
             np.array([frame.window_covariances[stamp] for stamp in stamps]).reshape(-1, 6, 6),
             float(self._sigmas.value),
         )
-        self._draw_cloud(frame)
-
-    def _draw_cloud(self, frame: FrameView) -> None:
-        """Draw the accumulated points; they change with keyframes alone."""
+        # The accumulated points change with keyframes alone.
         newest = frame.keyframes[-1] if frame.keyframes else 0
         if self._shown_cloud != (newest, self._player.first_index):
             self._shown_cloud = (newest, self._player.first_index)
