@@ -400,8 +400,7 @@ def _config(
     lists: dict[str, list[Any]] = {f"{type_}s": [] for type_ in _TYPES.values()}
     for name, value in values.items():
         type_ = _TYPES[type(value)]
-        item = _make(f"{type_.capitalize()}Parameter", name=name, value=value)
-        lists[f"{type_}s"].append(item)
+        lists[f"{type_}s"].append(_make(f"{type_.capitalize()}Parameter", name=name, value=value))
     groups = [
         _make("GroupState", name=name, state=name not in closed, id=index, parent=0)
         for index, name in enumerate(["Default", *sections] if sections else [])
@@ -409,9 +408,8 @@ def _config(
     return _make("Config", groups=groups, **lists)
 
 
-def _make(name: str, /, **fields: object) -> Any:  # noqa: ANN401 - made at run time
-    make_message: Callable[..., Any] = typestore(is_ros1=True).types[f"{_PACKAGE}/{name}"]
-    return make_message(**fields)
+def _make(name: str, /, **fields: Any) -> Any:  # noqa: ANN401 - made at run time
+    return typestore(is_ros1=True).types[f"{_PACKAGE}/{name}"](**fields)
 
 
 def _opened(node: Ros1, topic: str, name: str) -> Callable[[object], None]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -74,7 +74,7 @@ class MessageWriter(ABC):
         self.is_ros1, self._name = is_ros1, name
         self._store = typestore(is_ros1=is_ros1)
 
-    def make(self, type_: str, **fields: object) -> Any:  # noqa: ANN401 - made at run time
+    def make(self, type_: str, **fields: Any) -> Any:  # noqa: ANN401 - made at run time
         """Return a message.
 
         Parameters
@@ -84,8 +84,7 @@ class MessageWriter(ABC):
         **fields
             All its fields, by name.
         """
-        make_message: Callable[..., Any] = self._store.types[type_]
-        return make_message(**fields)
+        return self._store.types[type_](**fields)
 
     def header(self, header: Header) -> Any:  # noqa: ANN401 - made at run time
         """Return the message of a header.
