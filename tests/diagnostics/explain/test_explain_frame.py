@@ -229,10 +229,12 @@ def test_it_is_told_how_far_rows_are_moved_for_the_readout_assumed(kind: str) ->
         # What is shown of the refinement is the last of two rounds, the result.
         assert explanation.refinement is not None
         assert explanation.result.registration is not None
-        T = explanation.refinement.drawn.T_target_source[1]
-        np.testing.assert_array_equal(
-            se3.invert(T), explanation.result.registration.T_reference_current
-        )
+        found = explanation.result.registration
+        assert explanation.refinement.n_inliers[1] == found.n_inliers
+        # The reference's velocity is known better since its own step: that corrects the result.
+        T = se3.invert(explanation.refinement.drawn.T_target_source[1])
+        atol = 0.0 if readout_ms == 0.0 else 1e-3
+        np.testing.assert_allclose(T, found.T_reference_current, rtol=0.0, atol=atol)
     assert moved_px[0] == 0.0
     assert 0.3 < moved_px[1] < 20.0
     assert moved_px[2] == pytest.approx(2.0 * moved_px[1], rel=0.2)
