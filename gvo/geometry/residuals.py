@@ -170,8 +170,9 @@ class StereoResiduals:
         J *= matches.source_sigmas.T[:, np.newaxis]
         _write_factors(columns[6:12], J, matches.target_sigmas.T**2)
         expected = tuple(matches.expected.get(name, 0.0) for name in constants)
-        residuals = cls(columns=columns, camera=camera, huber=huber, constants=constants)
-        return replace(residuals, expected=expected) if constants else residuals
+        return cls(
+            columns=columns, camera=camera, huber=huber, constants=constants, expected=expected
+        )
 
     @property
     def source_points(self) -> FloatArray:
