@@ -300,6 +300,9 @@ class RelativePose:
         Maps coordinates of the current camera to the reference camera, metres.
     covariance : ndarray of float64, shape (6, 6)
         Of (rx, ry, rz, tx, ty, tz), right perturbation, in the current camera frame.
+    passing_covariance : ndarray of float64, shape (6, 6)
+        The part of it that the next registration from the current frame takes back, so that it
+        does not add up along a chain.
     matches : ndarray of int64, shape (n, 2)
         Indices into the observations of reference and current; -1 where the current frame
         holds none of the point. Empty where the front-end does not tell.
@@ -319,6 +322,7 @@ class RelativePose:
 
     T_reference_current: FloatArray
     covariance: FloatArray
+    passing_covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
     matches: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
     inliers: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     pixels_reference: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))

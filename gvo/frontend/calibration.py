@@ -16,7 +16,7 @@ doi:10.1109/CVPR.2012.6247831.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 from weakref import WeakKeyDictionary, ref
@@ -29,9 +29,9 @@ from gvo.frontend.registration import check_rows, estimate_roughly, register_cor
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
-from gvo.geometry.ransac import find_inliers
+from gvo.geometry.ransac import Consensus
 from gvo.geometry.refinement import Adjustment, adjust
-from gvo.geometry.residuals import StereoResiduals
+from gvo.geometry.residuals import StereoResiduals, pose_jacobian
 from gvo.types import (
     ConstantError,
     Failure,
@@ -51,9 +51,11 @@ _READOUT_FACTOR = 5.0
 # What registrations are told to doubt besides.
 _VELOCITIES = tuple(f"velocity{axis}" for axis in range(6))
 # Change of the newest frame's velocity, relative to the last step, where that before is unknown;
-# and the smallest sigma along an axis, rad/s and m/s.
+# the smallest sigma along an axis, rad/s and m/s; and that of its shift, relative to how much this
+# changed: most of that is noise of the steps.
 _FIRST_CHANGE = 0.2
 _LEAST_CHANGE = 0.01
+_SHIFT_SHARE = 0.3
 # Gauss-Newton steps of a velocity that is measured, and the share of the matches that have to agree
 # on it: it is fitted to what is there.
 _N_ITERATIONS = 3
@@ -172,22 +174,22 @@ class MeasuredVelocity:
 
     Parameters
     ----------
-    velocity : ndarray of float64, shape (6,)
-        Twist per second (rad/s, m/s), right of the pose.
+    extrapolated : ndarray of float64, shape (6,)
+        The velocity as it was before: a twist per second (rad/s, m/s), right of the pose.
     sigmas : ndarray of float64, shape (6,)
-        Of the velocity as extrapolated, rad/s and m/s.
+        Of that, rad/s and m/s.
     found : Adjustment
         The step, and by how much the velocity differs from that, in these sigmas.
     """
 
-    velocity: FloatArray
+    extrapolated: FloatArray
     sigmas: FloatArray
     found: Adjustment
 
     @property
-    def extrapolated(self) -> FloatArray:
-        """The velocity as it was before, shape (6,)."""
-        return self.velocity - self.sigmas * self.found.values
+    def velocity(self) -> FloatArray:
+        """The velocity as measured, shape (6,)."""
+        return self.extrapolated + self.sigmas * self.found.values
 
 
 class FrameVelocities:
@@ -286,7 +288,7 @@ class FrameVelocities:
 def _along_each_axis(change: FloatArray) -> FloatArray:
     """Return the sigmas of a velocity (6,) that changes as much as this along any axis."""
     turn, shift = (np.linalg.norm(part) / math.sqrt(3.0) for part in (change[:3], change[3:]))
-    return np.maximum([turn] * 3 + [shift] * 3, _LEAST_CHANGE)
+    return np.maximum([turn] * 3 + [_SHIFT_SHARE * shift] * 3, _LEAST_CHANGE)
 
 
 class RigOffsets:
@@ -627,22 +629,23 @@ class CalibratedCamera:
         velocities = self._offsets.velocities
         first, second = measured.frames
         hints: dict[str, Any] = {"stamps_ns": (first.stamp_ns, second.stamp_ns), "prior": prior}
+        rough: Consensus | Failure | None = None
         told: MeasuredVelocity | None = None
         # A first step has no velocity yet to start from.
         is_known = velocities.of(first) is not None
         if is_step and is_known and self._offsets.possible_readout_s > 0.0:
             rough = estimate_roughly(self._corrected(measured), self._camera, config, **hints)
-            # What fails is tried again as a whole, to tell why.
-            if not isinstance(rough, Failure):
-                hints["T_start"] = rough
-                velocities.expect(first, second, se3.invert(rough))
-                told = self._measure_velocity(measured, rough, config)
+        # What fails is tried again as a whole, to tell why.
+        if isinstance(rough, Consensus):
+            velocities.expect(first, second, se3.invert(rough.T_target_source))
+            told = self._measure_velocity(measured, rough, config)
             if told is not None:
-                hints["T_start"] = told.found.T_target_source
-                velocities.expect(first, second, se3.invert(told.found.T_target_source))
+                rough = replace(rough, T_target_source=told.found.T_target_source)
+                velocities.expect(first, second, se3.invert(rough.T_target_source))
                 velocities.measure(second, told)
+            hints["consensus"] = rough
         result = self._register(measured, config, hints, is_step=is_step)
-        if isinstance(result, Failure) and hints.pop("T_start", None) is not None:
+        if isinstance(result, Failure) and hints.pop("consensus", None) is not None:
             # What was found roughly may be the other one of two motions, or none.
             velocities.expect(first, second, (None if prior is None else prior.T_predicted))
             told = None
@@ -661,39 +664,39 @@ class CalibratedCamera:
         if isinstance(result, Failure):
             return result
         # In sigmas of what is known of each constant, as the sensitivities are.
-        in_sigmas = result.calibration_errors
+        constants = result.calibration_errors
         error = self._offsets.velocities.error(measured.frames[0])
         T_correction = np.eye(4) if error is None else se3.exp(error)
         first_pixels, second_pixels = (uvd[:, :2] for uvd in measured.uvd)
+        by_learnt, by_velocity = self._covariances_by_constants(constants, measured.frames[1])
         return replace(
             result,
             T_reference_current=T_correction @ result.T_reference_current,
-            covariance=measured.sigma_factor**2 * result.covariance
-            + self._covariance_by_constants(in_sigmas, measured.frames[1]),
+            covariance=measured.sigma_factor**2 * result.covariance + by_learnt + by_velocity,
+            passing_covariance=by_velocity,
             calibration_errors={
                 name: each.times(self._offsets.learnt[name].sigma)
-                for name, each in in_sigmas.items()
+                for name, each in constants.items()
                 if name in self._offsets.learnt
             },
             pixels_reference=first_pixels,
             pixels_current=second_pixels,
         )
 
-    def _covariance_by_constants(
-        self, in_sigmas: Mapping[str, ConstantError], current: Stamped
-    ) -> FloatArray:
-        """Return the covariance of a pose, shape (6, 6), by what constants are in doubt."""
-        effects = np.array([each.effect for each in in_sigmas.values()]).reshape(-1, 6)
-        left = np.eye(len(effects))
+    def _covariances_by_constants(
+        self, constants: Mapping[str, ConstantError], current: Stamped
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return covariances of a pose, shape (6, 6), by what is learnt and by the velocity."""
         told = self._offsets.velocities.measured(current)
-        if told is not None:
-            axes = [_VELOCITIES.index(name) for name in in_sigmas if name in _VELOCITIES]
-            rows = [i for i, name in enumerate(in_sigmas) if name in _VELOCITIES]
-            left[np.ix_(rows, rows)] = told.found.covariance[np.ix_(axes, axes)]
-        return np.asarray(effects.T @ left @ effects)
+        known = np.eye(len(_VELOCITIES)) if told is None else told.found.covariance
+        axes = [n for n, name in enumerate(_VELOCITIES) if name in constants]
+        by_axis = np.array([constants[_VELOCITIES[n]].effect for n in axes]).reshape(-1, 6)
+        learnt = [each.effect for name, each in constants.items() if name not in _VELOCITIES]
+        by_learnt = np.array(learnt).reshape(-1, 6)
+        return by_learnt.T @ by_learnt, by_axis.T @ known[np.ix_(axes, axes)] @ by_axis
 
     def _measure_velocity(
-        self, measured: Measurements, T: FloatArray, config: Config
+        self, measured: Measurements, rough: Consensus, config: Config
     ) -> MeasuredVelocity | None:
         """Estimate the velocity of the current frame together with the step, by all inliers.
 
@@ -704,30 +707,31 @@ class CalibratedCamera:
         velocity, sigmas = offsets.velocities.of(current), offsets.velocities.sigmas(current)
         if velocity is None or sigmas is None or offsets.readout_s == 0.0:
             return None
-        sensitivities = self._by_velocity(measured, sigmas, offsets.readout_s)
-        prepared = replace(self._corrected(measured), sensitivities=sensitivities)
-        inliers = find_inliers(T[np.newaxis], prepared, self._camera, config.ransac)[0]
-        n_needed = max(config.ransac.min_inliers, _MIN_MEASURED_SHARE * len(inliers))
-        if np.count_nonzero(inliers) < n_needed:
+        n_needed = max(config.ransac.min_inliers, _MIN_MEASURED_SHARE * len(rough.inliers))
+        if np.count_nonzero(rough.inliers) < n_needed:
             return None
-        huber = config.registration.huber
-        residuals = StereoResiduals.of(T, prepared, self._camera, huber=huber).select(inliers)
+        corrected = self._corrected(measured)
+        prepared = replace(
+            corrected, sensitivities=self._by_velocity(corrected, sigmas, offsets.readout_s)
+        )
+        T, huber = rough.T_target_source, config.registration.huber
+        residuals = StereoResiduals.of(T, prepared, self._camera, huber=huber).select(rough.inliers)
         factor = measured.sigma_factor
         found = adjust(T, residuals, n_iterations=_N_ITERATIONS, sigma_factor=factor)
         if found is None:
             return None
-        return MeasuredVelocity(
-            velocity=velocity + sigmas * found.values, sigmas=sigmas, found=found
-        )
+        return MeasuredVelocity(extrapolated=velocity, sigmas=sigmas, found=found)
 
     def _by_velocity(
-        self, measured: Measurements, sigmas: FloatArray, readout_s: float
+        self, corrected: Correspondences, sigmas: FloatArray, readout_s: float
     ) -> dict[str, FloatArray]:
         """Return the derivatives of corrected measurements by errors of the current velocity."""
-        return {
-            name: -readout_s * self._settling_rates(measured, (None, sigma))
-            for name, sigma in zip(_VELOCITIES, np.diag(sigmas), strict=True)
-        }
+        rates = pose_jacobian(corrected.target_points.T, self._camera)
+        rates *= -readout_s * _row_times(corrected.target_uvd[:, 1], self._camera)
+        rates *= sigmas[:, np.newaxis, np.newaxis]
+        still = np.zeros_like(rates)
+        both = np.swapaxes(np.stack([still, rates], axis=1), 2, 3)
+        return dict(zip(_VELOCITIES, both, strict=True))
 
     def _corrected(self, measured: Measurements) -> Correspondences:
         reference, current = (
@@ -747,11 +751,11 @@ class CalibratedCamera:
         readout_s = self._offsets.possible_readout_s if is_step else self._offsets.readout_s
         velocities, current = self._offsets.velocities, measured.frames[1]
         sigmas, told = velocities.sigmas(current), velocities.measured(current)
+        corrected = self._corrected(measured)
         if sigmas is not None and readout_s != 0.0:
-            sensitivities |= self._by_velocity(measured, sigmas, readout_s)
+            sensitivities |= self._by_velocity(corrected, sigmas, readout_s)
         # As extrapolated it tells the readout: what rows tell of it rests on the readout assumed.
         expected = {} if told is None else dict(zip(_VELOCITIES, -told.found.values, strict=True))
-        corrected = self._corrected(measured)
         return replace(corrected, sensitivities=sensitivities, expected=expected)
 
     def _sensitivity(self, name: str, measured: Measurements) -> FloatArray:
@@ -762,14 +766,8 @@ class CalibratedCamera:
         told = self._offsets.velocities.measured(measured.frames[1])
         if told is not None:
             velocities[1] = told.extrapolated
-        return -self._settling_rates(measured, velocities)
-
-    def _settling_rates(
-        self, measured: Measurements, velocities: Sequence[FloatArray | None]
-    ) -> FloatArray:
-        """Return the derivatives of corrected measurements by the readout time, (2, n, 3)."""
         rates = [
             settling_rates(uvd - self._offset(), velocity, self._camera)
             for velocity, uvd in zip(velocities, measured.uvd, strict=True)
         ]
-        return np.stack(rates)
+        return -np.stack(rates)

@@ -301,7 +301,8 @@ class RawChain(Generic[ObservationsT]):
     ) -> RawStep:
         reference, stamp_ns = node.estimate, current.stamp_ns
         T, covariance = result.T_reference_current, result.covariance
-        estimate = poses.append(reference, stamp_ns, T, variance_factor * covariance)
+        lasting = variance_factor * (covariance - result.passing_covariance)
+        estimate = poses.append(reference, stamp_ns, T, lasting)
         is_steady = self._note_velocity(poses, result, 1e-9 * (stamp_ns - reference.stamp_ns))
         n_steps = node.n_steps + 1
         self._nodes = [_Node(observations=current, estimate=estimate, n_steps=n_steps)]
