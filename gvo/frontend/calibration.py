@@ -29,8 +29,8 @@ from gvo.frontend.registration import check_rows, estimate_roughly, register_cor
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
-from gvo.geometry.ransac import Consensus
-from gvo.geometry.refinement import Adjustment, adjust
+from gvo.geometry.ransac import find_inliers
+from gvo.geometry.refinement import Adjustment, adjust, estimate_constants
 from gvo.geometry.residuals import StereoResiduals, pose_jacobian
 from gvo.types import (
     ConstantError,
@@ -56,10 +56,8 @@ _VELOCITIES = tuple(f"velocity{axis}" for axis in range(6))
 _FIRST_CHANGE = 0.2
 _LEAST_CHANGE = 0.01
 _SHIFT_SHARE = 0.3
-# Gauss-Newton steps of a velocity that is measured, and the share of the matches that have to agree
-# on it: it is fitted to what is there.
+# Gauss-Newton steps of a velocity that is measured.
 _N_ITERATIONS = 3
-_MIN_MEASURED_SHARE = 0.5
 # A row offset of the right image, the median of many measurements, that is worth a word.
 _LEAST_ROW_PX = 0.04
 # Stamps nearer to each other than this, in seconds, tell no velocity.
@@ -387,8 +385,7 @@ class RigOffsets:
     def note(self, result: RelativePose, stamp_ns: int) -> None:
         """Take what a registration tells.
 
-        The first of each frame, its step, counts for the offset of the disparities. Keyframes tell
-        the readout best, seen by a camera that moved another way; the step counts without them.
+        The first of each frame, its step, counts for the offset of the disparities.
 
         Parameters
         ----------
@@ -397,15 +394,14 @@ class RigOffsets:
         stamp_ns : int
             Of the current frame.
         """
-        errors = {k: each for k, each in result.calibration_errors.items() if k in self.learnt}
         is_new = self._last_ns is None or stamp_ns > self._last_ns
-        if is_new and DISPARITY in errors:
+        if is_new and DISPARITY in result.calibration_errors:
             self._last_ns = stamp_ns
-            self._disparity_error = errors[DISPARITY]
-        if READOUT in errors:
-            # Matches that a wrong readout time contradicts are outliers, the others confirm it.
-            doubt = (result.n_matches / result.n_inliers) ** 2
-            self._readout_errors.append(errors[READOUT].widened(doubt))
+            self._disparity_error = result.calibration_errors[DISPARITY]
+
+    def note_readout(self, error: ConstantError) -> None:
+        """Take what a link tells of the readout time, after the present value was subtracted."""
+        self._readout_errors.append(error)
 
     def note_rows(self, row_px: float | None, stamp_ns: int) -> None:
         """Take the row offset of a frame; each frame counts once.
@@ -433,7 +429,7 @@ class RigOffsets:
         if self._row_px is not None:
             self.row.update(self._row_px - self.row.value, _ROW_SIGMA_PX)
         used_s = self.readout_s
-        for error in self._readout_errors[1:] or self._readout_errors:
+        for error in self._readout_errors:
             left_s = used_s + error.value - self.readout.value
             self.readout.update(left_s, _READOUT_FACTOR * error.sigma)
         self._disparity_error, self._row_px, self._readout_errors = None, None, []
@@ -591,6 +587,8 @@ class CalibratedCamera:
 
     def __init__(self, camera: StereoCamera, offsets: RigOffsets) -> None:
         self._camera, self._offsets = camera, offsets
+        # Of the newest frame, by the stamps of their keyframes.
+        self._links: dict[int, tuple[Measurements, RelativePose]] = {}
 
     def correct(self, observations: Stamped, uvd: FloatArray) -> FloatArray:
         """Return measured (u, v, disparity), shape (n, 3), as a camera without errors has them."""
@@ -629,37 +627,47 @@ class CalibratedCamera:
         velocities = self._offsets.velocities
         first, second = measured.frames
         hints: dict[str, Any] = {"stamps_ns": (first.stamp_ns, second.stamp_ns), "prior": prior}
-        rough: Consensus | Failure | None = None
-        told: MeasuredVelocity | None = None
         # A first step has no velocity yet to start from.
-        is_known = velocities.of(first) is not None
-        if is_step and is_known and self._offsets.possible_readout_s > 0.0:
-            rough = estimate_roughly(self._corrected(measured), self._camera, config, **hints)
-        # What fails is tried again as a whole, to tell why.
-        if isinstance(rough, Consensus):
-            velocities.expect(first, second, se3.invert(rough.T_target_source))
-            told = self._measure_velocity(measured, rough, config)
-            if told is not None:
-                rough = replace(rough, T_target_source=told.found.T_target_source)
-                velocities.expect(first, second, se3.invert(rough.T_target_source))
-                velocities.measure(second, told)
-            hints["consensus"] = rough
-        result = self._register(measured, config, hints, is_step=is_step)
-        if isinstance(result, Failure) and hints.pop("consensus", None) is not None:
+        if is_step and self._offsets.readout_s != 0.0 and velocities.of(first) is not None:
+            hints["T_start"] = self._move_rows(measured, config, hints)
+        result = self._register(measured, config, hints)
+        if isinstance(result, Failure) and hints.pop("T_start", None) is not None:
             # What was found roughly may be the other one of two motions, or none.
             velocities.expect(first, second, (None if prior is None else prior.T_predicted))
-            told = None
-            result = self._register(measured, config, hints, is_step=is_step)
+            result = self._register(measured, config, hints)
         if isinstance(result, Failure):
             return result
-        if is_step and told is None:
+        if not is_step:
+            self._links[first.stamp_ns] = measured, result
+            return check_rows(result, self._camera)
+        if velocities.measured(second) is None:
             velocities.expect(first, second, result.T_reference_current)
+        self._learn_readout(first, config)
         return check_rows(result, self._camera)
 
+    def _move_rows(
+        self, measured: Measurements, config: Config, hints: Mapping[str, Any]
+    ) -> FloatArray | None:
+        """Take over the velocities of both frames by a rough step; return that, T_target_source.
+
+        What fails, None, is tried again as a whole, to tell why.
+        """
+        velocities, frames = self._offsets.velocities, measured.frames
+        rough = estimate_roughly(self._corrected(measured), self._camera, config, **hints)
+        if isinstance(rough, Failure):
+            return None
+        velocities.expect(*frames, se3.invert(rough))
+        told = self._measure_velocity(measured, rough, config)
+        if told is None:
+            return rough
+        velocities.expect(*frames, se3.invert(told.found.T_target_source))
+        velocities.measure(frames[1], told)
+        return told.found.T_target_source
+
     def _register(
-        self, measured: Measurements, config: Config, hints: Mapping[str, Any], *, is_step: bool
+        self, measured: Measurements, config: Config, hints: Mapping[str, Any]
     ) -> RelativePose | Failure:
-        prepared = self._prepared(measured, is_step=is_step)
+        prepared = self._prepared(measured)
         result = register_correspondences(prepared, measured.matches, self._camera, config, **hints)
         if isinstance(result, Failure):
             return result
@@ -696,7 +704,7 @@ class CalibratedCamera:
         return by_learnt.T @ by_learnt, by_axis.T @ known[np.ix_(axes, axes)] @ by_axis
 
     def _measure_velocity(
-        self, measured: Measurements, rough: Consensus, config: Config
+        self, measured: Measurements, T: FloatArray, config: Config
     ) -> MeasuredVelocity | None:
         """Estimate the velocity of the current frame together with the step, by all inliers.
 
@@ -705,17 +713,16 @@ class CalibratedCamera:
         """
         offsets, current = self._offsets, measured.frames[1]
         velocity, sigmas = offsets.velocities.of(current), offsets.velocities.sigmas(current)
-        if velocity is None or sigmas is None or offsets.readout_s == 0.0:
-            return None
-        n_needed = max(config.ransac.min_inliers, _MIN_MEASURED_SHARE * len(rough.inliers))
-        if np.count_nonzero(rough.inliers) < n_needed:
+        if velocity is None or sigmas is None:
             return None
         corrected = self._corrected(measured)
-        prepared = replace(
-            corrected, sensitivities=self._by_velocity(corrected, sigmas, offsets.readout_s)
-        )
-        T, huber = rough.T_target_source, config.registration.huber
-        residuals = StereoResiduals.of(T, prepared, self._camera, huber=huber).select(rough.inliers)
+        sensitivities = self._by_velocity(corrected, sigmas, offsets.readout_s)
+        prepared = replace(corrected, sensitivities=sensitivities)
+        inliers = find_inliers(T[np.newaxis], prepared, self._camera, config.ransac)[0]
+        if np.count_nonzero(inliers) < config.ransac.min_inliers:
+            return None
+        huber = config.registration.huber
+        residuals = StereoResiduals.of(T, prepared, self._camera, huber=huber).select(inliers)
         factor = measured.sigma_factor
         found = adjust(T, residuals, n_iterations=_N_ITERATIONS, sigma_factor=factor)
         if found is None:
@@ -740,32 +747,49 @@ class CalibratedCamera:
         note("rows.settled", measured=measured.uvd[1] - self._offset(), settled=current)
         return Correspondences.of_pixels((reference, current), measured.sigmas, self._camera)
 
-    def _prepared(self, measured: Measurements, *, is_step: bool) -> Correspondences:
+    def _prepared(self, measured: Measurements) -> Correspondences:
         """Return what was measured, corrected, with its derivatives by what is in doubt."""
+        corrected = self._corrected(measured)
         sensitivities = {
             name: self._sensitivity(name, measured) * constant.sigma
             for name, constant in self._offsets.learnt.items()
         }
-        # The change of velocity that tells a step the readout is as large as its doubt: it counts
-        # before the readout is known.
-        readout_s = self._offsets.possible_readout_s if is_step else self._offsets.readout_s
-        velocities, current = self._offsets.velocities, measured.frames[1]
-        sigmas, told = velocities.sigmas(current), velocities.measured(current)
-        corrected = self._corrected(measured)
+        sigmas = self._offsets.velocities.sigmas(measured.frames[1])
+        # What a readout that is not known yet may do counts, too.
+        readout_s = self._offsets.possible_readout_s
         if sigmas is not None and readout_s != 0.0:
             sensitivities |= self._by_velocity(corrected, sigmas, readout_s)
-        # As extrapolated it tells the readout: what rows tell of it rests on the readout assumed.
-        expected = {} if told is None else dict(zip(_VELOCITIES, -told.found.values, strict=True))
-        return replace(corrected, sensitivities=sensitivities, expected=expected)
+        return replace(corrected, sensitivities=sensitivities)
+
+    def _learn_readout(self, frame: Stamped, config: Config) -> None:
+        """Take what the links of a frame tell, now that the step after it is known, too.
+
+        Keyframes tell the readout best, seen by a camera that moved another way. A velocity that is
+        extrapolated would not do: changes of velocity that are noise look like a shorter readout.
+        """
+        for measured, link in self._links.values():
+            if measured.frames[1] is not frame:
+                continue
+            T = se3.invert(link.T_reference_current)
+            residuals = StereoResiduals.of(
+                T, self._prepared(measured), self._camera, huber=config.registration.huber
+            ).select(link.inliers)
+            at = residuals.linearize(T)
+            if isinstance(at, Failure):
+                continue
+            error = estimate_constants(T, residuals, at).get(READOUT)
+            if error is not None:
+                # Matches that a wrong readout time contradicts are outliers, the others confirm it.
+                doubt = (link.n_matches / link.n_inliers) ** 2
+                error = error.times(self._offsets.readout.sigma).widened(doubt)
+                self._offsets.note_readout(error)
+        self._links = {}
 
     def _sensitivity(self, name: str, measured: Measurements) -> FloatArray:
         """Return the derivatives of corrected measurements by an error of a constant."""
         if name == DISPARITY:
             return np.tile([0.0, 0.0, 1.0], (2, len(measured.matches), 1))
         velocities = [self._offsets.velocities.of(frame) for frame in measured.frames]
-        told = self._offsets.velocities.measured(measured.frames[1])
-        if told is not None:
-            velocities[1] = told.extrapolated
         rates = [
             settling_rates(uvd - self._offset(), velocity, self._camera)
             for velocity, uvd in zip(velocities, measured.uvd, strict=True)

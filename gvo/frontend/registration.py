@@ -67,7 +67,7 @@ def register_correspondences(
     *,
     stamps_ns: tuple[int, int],
     prior: MotionPrior | None = None,
-    consensus: Consensus | None = None,
+    T_start: FloatArray | None = None,
 ) -> RelativePose | Failure:
     """Estimate the motion between two frames from 3D-3D correspondences.
 
@@ -87,8 +87,8 @@ def register_correspondences(
         Where most matches agree with its prediction, RANSAC is skipped: the refinement starts
         from it, and chooses its inliers anew (not with `registration.refine` none, where the fit
         to the consensus is the result).
-    consensus : Consensus, optional
-        Of the matches, where it is known; see `estimate_roughly`.
+    T_start : ndarray of float64, shape (4, 4), optional
+        T_target_source that is used so in place of the prediction.
 
     Returns
     -------
@@ -96,10 +96,14 @@ def register_correspondences(
     """
     given = {"correspondences": correspondences, "matches": matches, "stamps_ns": stamps_ns}
     note("registration.begin", **given)
-    found = consensus or _find_consensus(correspondences, camera, config, stamps_ns, prior)
-    if isinstance(found, Failure):
-        return found
-    refined = _refine(found, correspondences, camera, config)
+    if prior is not None and T_start is None:
+        T_start = se3.invert(prior.T_predicted)
+    known = _known_consensus(T_start, correspondences, camera, config)
+    consensus = known or search_consensus(correspondences, camera, config, stamps_ns)
+    note("registration.consensus", consensus=consensus, is_known=known is not None)
+    if isinstance(consensus, Failure):
+        return consensus
+    refined = _refine(consensus, correspondences, camera, config)
     if isinstance(refined, Refinement) and config.registration.refine != "none":
         refined = verify_motion(
             *(refined, correspondences, camera, config),
@@ -107,7 +111,7 @@ def register_correspondences(
             make_rng=partial(_rng, config, stamps_ns),
         )
         note("registration.verified", refined=refined)
-    return _conclude(refined, found, correspondences, matches, config.ransac.min_inliers)
+    return _conclude(refined, consensus, correspondences, matches, config.ransac.min_inliers)
 
 
 def estimate_roughly(
@@ -117,29 +121,17 @@ def estimate_roughly(
     *,
     stamps_ns: tuple[int, int],
     prior: MotionPrior | None,
-) -> Consensus | Failure:
-    """Return a consensus after a few steps, not verified; as `register_correspondences`."""
-    found = _find_consensus(correspondences, camera, config, stamps_ns, prior)
+) -> FloatArray | Failure:
+    """Return T_target_source after a few steps, not verified; as `register_correspondences`."""
+    T = None if prior is None else se3.invert(prior.T_predicted)
+    known = _known_consensus(T, correspondences, camera, config)
+    found = known or search_consensus(correspondences, camera, config, stamps_ns)
     if isinstance(found, Failure):
         return found
     T, huber = found.T_target_source, config.registration.huber
     residuals = StereoResiduals.of(T, correspondences, camera, huber=huber)
     refined = descend(T, residuals.select(found.inliers), n_iterations=_N_ROUGH_ITERATIONS)
-    return found if refined is None else replace(found, T_target_source=refined)
-
-
-def _find_consensus(
-    correspondences: Correspondences,
-    camera: StereoCamera,
-    config: Config,
-    stamps_ns: tuple[int, int],
-    prior: MotionPrior | None,
-) -> Consensus | Failure:
-    T = None if prior is None else se3.invert(prior.T_predicted)
-    known = _known_consensus(T, correspondences, camera, config)
-    found = known or search_consensus(correspondences, camera, config, stamps_ns)
-    note("registration.consensus", consensus=found, is_known=known is not None)
-    return found
+    return T if refined is None else refined
 
 
 def _known_consensus(

@@ -244,12 +244,12 @@ def test_a_rough_estimate_is_near_and_starts_the_next_without_samples(is_predict
     assert isinstance(found, RelativePose)
     assert not isinstance(rough, Failure)
     # Not as good: its inliers are those of the prediction or of a sample.
-    difference = se3.log(rough.T_target_source @ found.T_reference_current)
+    difference = se3.log(rough @ found.T_reference_current)
     assert difference @ np.linalg.solve(found.covariance, difference) / 6 < 5.0
     assert np.linalg.norm(difference) < 0.5 * np.linalg.norm(se3.log(np.linalg.inv(T) @ start))
     with pytest.MonkeyPatch.context() as patch:
         forbid_search(patch)
-        again = register_correspondences(*given, stamps_ns=(10, 20), consensus=rough)
+        again = register_correspondences(*given, stamps_ns=(10, 20), T_start=rough)
     assert isinstance(again, RelativePose)
     difference = se3.log(np.linalg.inv(found.T_reference_current) @ again.T_reference_current)
     assert difference @ np.linalg.solve(found.covariance, difference) / 6 < 0.5
