@@ -628,7 +628,8 @@ class CalibratedCamera:
         first, second = measured.frames
         hints: dict[str, Any] = {"stamps_ns": (first.stamp_ns, second.stamp_ns), "prior": prior}
         # A first step has no velocity yet to start from.
-        if is_step and self._offsets.readout_s != 0.0 and velocities.of(first) is not None:
+        is_known = velocities.of(first) is not None
+        if is_step and is_known and self._offsets.possible_readout_s != 0.0:
             hints["T_start"] = self._move_rows(measured, config, hints)
         result = self._register(measured, config, hints)
         if isinstance(result, Failure) and hints.pop("T_start", None) is not None:
@@ -713,7 +714,7 @@ class CalibratedCamera:
         """
         offsets, current = self._offsets, measured.frames[1]
         velocity, sigmas = offsets.velocities.of(current), offsets.velocities.sigmas(current)
-        if velocity is None or sigmas is None:
+        if velocity is None or sigmas is None or offsets.readout_s == 0.0:
             return None
         corrected = self._corrected(measured)
         sensitivities = self._by_velocity(corrected, sigmas, offsets.readout_s)
