@@ -259,11 +259,22 @@ def status(title: str) -> Iterator[Callable[[str], None]]:
 
 
 @contextmanager
-def _handling(receive: Callable[[int, object], None]) -> Iterator[None]:
-    """Handle signals by a function as long as the context lasts."""
-    before = {number: signal.signal(number, receive) for number in _EXIT_CODES_OF_SIGNALS}
+def _handling(receive: Callable[[list[int]], None]) -> Iterator[list[int]]:
+    """Tell a function of each signal with those before; an interrupt exits as the first one says.
+
+    The list that is yielded holds the signals so far.
+    """
+    received: list[int] = []
+
+    def handle(number: int, frame: object) -> None:
+        received.append(number)
+        receive(received)
+
+    before = {number: signal.signal(number, handle) for number in _EXIT_CODES_OF_SIGNALS}
     try:
-        yield
+        yield received
+    except KeyboardInterrupt:
+        raise SystemExit(_EXIT_CODES_OF_SIGNALS[received[0]] if received else 130) from None
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -272,37 +283,30 @@ def _handling(receive: Callable[[int, object], None]) -> Iterator[None]:
 @contextmanager
 def ended_by_signals() -> Iterator[None]:
     """Let a signal end the command at once, with one line and its exit code."""
-    received: list[int] = []
 
-    def receive(number: int, frame: object) -> None:
-        received.append(number)
-        raise SystemExit(_EXIT_CODES_OF_SIGNALS[number])
+    def receive(received: list[int]) -> None:
+        raise SystemExit(_EXIT_CODES_OF_SIGNALS[received[-1]])
 
-    try:
-        with _handling(receive):
+    with _handling(receive) as received:
+        try:
             yield
-    finally:
-        if received:
-            typer.echo("gvo: interrupted; the same command begins anew", err=True)
+        finally:
+            if received:
+                typer.echo("gvo: interrupted; the same command begins anew", err=True)
 
 
 @contextmanager
 def ended_by_a_signal(stop: Callable[[], None]) -> Iterator[None]:
     """Let the first signal end what has no end of its own; a second one interrupts it."""
-    received: list[int] = []
 
-    def receive(number: int, frame: object) -> None:
-        received.append(number)
+    def receive(received: list[int]) -> None:
         if len(received) > 1:
             raise KeyboardInterrupt
         # Not here: what stops may be held by the very code that the signal came into.
         threading.Thread(target=stop, daemon=True).start()
 
-    try:
-        with _handling(receive):
-            yield
-    except KeyboardInterrupt:
-        raise SystemExit(_EXIT_CODES_OF_SIGNALS[received[0]] if received else 130) from None
+    with _handling(receive):
+        yield
 
 
 class _UndrawnError(KeyboardInterrupt):
@@ -316,25 +320,21 @@ def interruptible() -> Iterator[Callable[[object], None]]:
     So a frame is either in all files or in none. A second signal ends at once, as does the first
     one after a call with `_WRITTEN`.
     """
-    received: list[int] = []
     kind = KeyboardInterrupt
 
-    def receive(number: int, frame: object) -> None:
-        received.append(number)
+    def receive(received: list[int]) -> None:
         if kind is _UndrawnError or len(received) > 1:
             raise kind
 
-    def check(state: object) -> None:
-        nonlocal kind
-        kind = _UndrawnError if state is _WRITTEN else KeyboardInterrupt
-        if received:
-            raise kind
+    with _handling(receive) as received:
 
-    try:
-        with _handling(receive):
-            yield check
-    except KeyboardInterrupt:
-        raise SystemExit(_EXIT_CODES_OF_SIGNALS[received[0]] if received else 130) from None
+        def check(state: object) -> None:
+            nonlocal kind
+            kind = _UndrawnError if state is _WRITTEN else KeyboardInterrupt
+            if received:
+                raise kind
+
+        yield check
 
 
 @contextmanager
