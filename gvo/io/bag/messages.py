@@ -238,10 +238,7 @@ def camera_fields(message: Any, where: str) -> CameraFields:  # noqa: ANN401 - R
         P=_matrix(message, "P"),
         binning=(int(message.binning_x), int(message.binning_y)),
         roi=RegionOfInterest(
-            x_offset=int(message.roi.x_offset),
-            y_offset=int(message.roi.y_offset),
-            width=int(message.roi.width),
-            height=int(message.roi.height),
+            **{name: int(getattr(message.roi, name)) for name in RegionOfInterest.__slots__}
         ),
         frame_id=bare(str(message.header.frame_id)),
     )

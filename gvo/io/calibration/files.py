@@ -355,8 +355,8 @@ def _of_matrices(content: Mapping[Any, Any], where: str) -> CameraFields:
 def _region(content: object, where: str) -> RegionOfInterest:
     if not isinstance(content, Mapping):
         return RegionOfInterest()
-    names = ("x_offset", "y_offset", "width", "height")
-    return RegionOfInterest(**{name: _count(content, name, f"{where}: roi") for name in names})
+    counts = {name: _count(content, name, f"{where}: roi") for name in RegionOfInterest.__slots__}
+    return RegionOfInterest(**counts)
 
 
 def _count(content: Mapping[Any, Any], key: str, where: str) -> int:
