@@ -20,7 +20,7 @@ from gvo.geometry.camera import Calibration, PinholeCamera, StereoCamera, rectif
 from gvo.io.calibration.files import read_cameras
 from gvo.io.depth_registration import DepthRegistration
 from gvo.io.excerpt import Excerpt, take_excerpt
-from gvo.io.images import depth_from_counts, depth_from_metres
+from gvo.io.images import MILLIMETRES, depth_from_counts, depth_from_metres
 from gvo.io.recording import DepthView, RecordingInfo, Sensor, Source, StampedImage
 from gvo.io.sync import Paired, StampFilter, pair_images
 from gvo.types import DepthArray, FaultyFrame, Frame, ImageArray, RgbdFrame, StereoFrame
@@ -28,7 +28,6 @@ from gvo.types import DepthArray, FaultyFrame, Frame, ImageArray, RgbdFrame, Ste
 _ROW_STEP = 64
 # Frames that are decoded ahead: with one, the thread idles where tracking a frame takes long.
 _N_AHEAD = 2
-_MILLIMETRES = 1000.0
 # What reading or decoding one image may raise besides, in a source of one's own as well.
 _LOAD_ERRORS = (OSError, MemoryError, ValueError, cv2.error)
 _Preparers: TypeAlias = tuple["ImagePreparer", "ImagePreparer"]
@@ -356,7 +355,7 @@ class Rig:
             n_images=0,
             T_body_cam=cameras.T_body_cam,
         )
-        self.depth_scale = cameras.depth_scale or _MILLIMETRES
+        self.depth_scale = cameras.depth_scale or MILLIMETRES
         self._preparers = make_preparers(self.info)
 
     @property

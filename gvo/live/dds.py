@@ -26,7 +26,7 @@ from gvo._text import cut
 from gvo.config import list_parameters, values_by_name
 from gvo.errors import ConfigurationError, GvoError, missing_extra
 from gvo.io.bag.reader import typestore
-from gvo.io.bag.topics import COMPRESSED_TYPE, IMAGE_TYPE, Topic
+from gvo.io.bag.topics import IMAGE_TYPES, Topic
 from gvo.live.transport import OnMessage, Parameters, Service, ServiceType, decode
 
 try:
@@ -120,7 +120,7 @@ class Dds:
 
     def subscribe(self, topic: str, type_: str, callback: OnMessage) -> Callable[[], None]:
         """Receive the messages of a topic; see `Transport`."""
-        is_image = type_ in (IMAGE_TYPE, COMPRESSED_TYPE)
+        is_image = type_ in IMAGE_TYPES
         offers = [each.qos for each in self._writers() if each.topic_name == f"rt{topic}"]
         is_reliable, is_held = (
             bool(offers) and all(offer[policy] not in (None, least) for offer in offers)

@@ -15,8 +15,7 @@ from gvo.io.bag.reader import BagMessage
 from gvo.io.bag.source import BagSource
 from gvo.io.bag.topics import (
     CAMERA_INFO_TYPE,
-    COMPRESSED_TYPE,
-    IMAGE_TYPE,
+    IMAGE_TYPES,
     CameraTopics,
     Topic,
     TopicChoice,
@@ -28,7 +27,6 @@ from gvo.io.recording import StampedImage
 from gvo.live.transport import Transport
 
 _SMALL = (CAMERA_INFO_TYPE, *TF_TYPES)
-_IMAGES = (IMAGE_TYPE, COMPRESSED_TYPE)
 _LOGGER = logging.getLogger(__name__)
 _OWN = "/gvo/"
 # Messages of each topic that are kept: what a calibration or a mount is read from.
@@ -116,7 +114,7 @@ class NetworkReader:
             self._changed.notify_all()
 
     def _subscribe(self, topic: Topic) -> None:
-        is_image = topic.type in _IMAGES
+        is_image = topic.type in IMAGE_TYPES
         self._kept[topic.name] = deque(maxlen=1 if is_image else _N_KEPT)
         take = partial(self._take, topic, is_image=is_image)
         self.transport.subscribe(topic.name, topic.type, take)
@@ -165,7 +163,7 @@ class TopicSource(BagSource):
     ) -> None:
         is_steady = reader.refresh()
         if not is_steady:
-            held = describe_topics([each for each in reader.topics if each.type in _IMAGES])
+            held = describe_topics([each for each in reader.topics if each.type in IMAGE_TYPES])
             raise RecordingError(f"{reader.transport.name}: image topics: {held or 'none'}")
         self._network = reader
         self._name = reader.transport.name

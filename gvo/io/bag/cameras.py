@@ -17,8 +17,8 @@ from gvo.io.bag.messages import camera_fields, decode_compressed, decode_compres
 from gvo.io.bag.reader import BagMessage, BagReader, MessageReader
 from gvo.io.bag.topics import (
     CAMERA_INFO_TYPE,
-    COMPRESSED_TYPE,
     IMAGE_TYPE,
+    IMAGE_TYPES,
     CameraTopics,
     Topic,
     camera_info_names,
@@ -183,8 +183,7 @@ def find_contradiction(reader: BagReader, *, by_camera_info: bool) -> str:
 
 
 def _image_names(file: BagFile) -> set[str]:
-    types = (IMAGE_TYPE, COMPRESSED_TYPE)
-    return {c.name for c, n in file.counts.items() if n > 0 and c.type in types}
+    return {c.name for c, n in file.counts.items() if n > 0 and c.type in IMAGE_TYPES}
 
 
 def _other_camera(reader: BagReader, files: Sequence[BagFile]) -> str:

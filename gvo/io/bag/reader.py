@@ -191,7 +191,7 @@ class BagReader:
         return files
 
     def _unpacked(self, path: Path) -> Path:
-        if path.suffix != ".zstd":
+        if path.suffix != _COMPRESSED:
             return path
         folder = Path(tempfile.mkdtemp(prefix="bag-"))
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)

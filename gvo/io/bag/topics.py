@@ -12,6 +12,7 @@ from gvo.io.recording import Sensor
 
 IMAGE_TYPE = "sensor_msgs/msg/Image"
 COMPRESSED_TYPE = "sensor_msgs/msg/CompressedImage"
+IMAGE_TYPES = (IMAGE_TYPE, COMPRESSED_TYPE)
 CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 
 _COMPRESSED_SUFFIXES = ("/compressed", "/compressedDepth")
@@ -119,7 +120,7 @@ def choose_topics(topics: Sequence[Topic], choice: TopicChoice, where: str) -> C
     RecordingError
         When there is no camera, or more than one; with the candidates and what to type.
     """
-    images = [topic for topic in topics if topic.type in (IMAGE_TYPE, COMPRESSED_TYPE)]
+    images = [topic for topic in topics if topic.type in IMAGE_TYPES]
     if not images:
         held = describe_topics(topics) or "no messages"
         raise RecordingError(f"{where}: holds no image topics; it holds {held}")
