@@ -239,20 +239,16 @@ def alignment(reference: Trajectory, estimate: Trajectory, mode: AlignMode) -> S
     if mode == "none":
         return Similarity(T_a_b=np.eye(4))
     if mode == "origin":
-        _refuse_without_rotations(reference, estimate)
+        for name, trajectory in {"reference": reference, "estimate": estimate}.items():
+            if not trajectory.has_rotations:
+                raise TrajectoryError(
+                    f"the {name} holds positions without rotations, its first pose cannot be "
+                    "aligned with; align by se3"
+                )
         return Similarity(T_a_b=reference.T_world_frame[0] @ se3.invert(estimate.T_world_frame[0]))
     if mode not in ("se3", "sim3"):
         raise ValueError(f"mode must be one of {get_args(AlignMode)}, got {mode!r}")
     return _fit(reference.positions, estimate.positions, is_scaled=mode == "sim3")
-
-
-def _refuse_without_rotations(reference: Trajectory, estimate: Trajectory) -> None:
-    for name, trajectory in {"reference": reference, "estimate": estimate}.items():
-        if not trajectory.has_rotations:
-            raise TrajectoryError(
-                f"the {name} holds positions without rotations, its first pose cannot be aligned "
-                "with; align by se3"
-            )
 
 
 def _fit(points_a: FloatArray, points_b: FloatArray, *, is_scaled: bool) -> Similarity:

@@ -305,16 +305,9 @@ def _announced_size(path: Path) -> int:
     return (65536 if page_size == 1 else page_size) * int.from_bytes(header[28:32], "big")
 
 
-def _bound_chunks() -> None:
-    """Let rosbags decompress the chunks of a file into bounded memory.
-
-    A thousand bytes of a chunk can become gigabytes, and it has no limit of its own. It looks the
-    functions up in two tables.
-    """
-    for name in ("bz2", "lz4"):
-        decompressors[name] = partial(inflate_whole, compression=name)
-    for name in ("lz4", "zstd"):
-        DECOMPRESSORS[name] = partial(inflate_whole, compression=name)
-
-
-_bound_chunks()
+# Let rosbags decompress the chunks of a file into bounded memory: a thousand bytes of a chunk can
+# become gigabytes, and it has no limit of its own. It looks the functions up in two tables.
+for _name in ("bz2", "lz4"):
+    decompressors[_name] = partial(inflate_whole, compression=_name)
+for _name in ("lz4", "zstd"):
+    DECOMPRESSORS[_name] = partial(inflate_whole, compression=_name)

@@ -158,9 +158,13 @@ def _assume_scale(paths: Iterable[str]) -> tuple[float, str]:
     and millimetres put it where it can.
     """
     for path in map(Path, paths):
-        median = _median_depth(path)
-        if median is None:
+        try:
+            depth = read_depth(path, DEFAULT_SCALE)
+        except RecordingError:
+            continue  # it becomes a faulty frame later
+        if not np.any(np.isfinite(depth)):
             continue
+        median = float(np.nanmedian(depth))
         if _is_plausible(median):
             break
         if _is_plausible(median * DEFAULT_SCALE / MILLIMETRES):
@@ -175,15 +179,6 @@ def _assume_scale(paths: Iterable[str]) -> tuple[float, str]:
         )
         return DEFAULT_SCALE, reason
     return DEFAULT_SCALE, "the default of TUM folders"
-
-
-def _median_depth(path: Path) -> float | None:
-    """Return the median of the known depth at the default scale; None where there is none."""
-    try:
-        depth = read_depth(path, DEFAULT_SCALE)
-    except RecordingError:
-        return None  # it becomes a faulty frame later
-    return float(np.nanmedian(depth)) if np.any(np.isfinite(depth)) else None
 
 
 def _is_plausible(median_m: float) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections import deque
 from collections.abc import Iterable, Iterator
-from contextlib import AbstractContextManager
 from itertools import count, islice
 from pathlib import Path
 
@@ -336,17 +335,14 @@ class GraphFile:
     def __init__(self, folder: Path) -> None:
         self._path = folder / GRAPH
         self._part = self._path.with_suffix(".g2o.part")
-        with self._refused_on_error():
+        with write_faults(OutputError, self._path):
             folder.mkdir(parents=True, exist_ok=True)
             self._path.unlink(missing_ok=True)
             self._file = self._part.open("w", encoding="utf-8", newline="\n")
 
-    def _refused_on_error(self) -> AbstractContextManager[None]:
-        return write_faults(OutputError, self._path)
-
     def add(self, stamp_ns: int, frame_id: FrameId, T_world_frame: FloatArray) -> None:
         """Write a smoothed pose, named by a whole number; they may come in any order."""
-        with self._refused_on_error():
+        with write_faults(OutputError, self._path):
             self._file.write(f"{stamp_ns} {g2o.format_vertex(str(frame_id), T_world_frame)}\n")
 
     def close(self, measurement_lines: Iterable[str]) -> None:
@@ -357,7 +353,7 @@ class GraphFile:
         measurement_lines : iterable of str
             Without their line ends.
         """
-        with self._refused_on_error():
+        with write_faults(OutputError, self._path):
             self._file.close()
             vertices = self._part.read_text(encoding="utf-8").splitlines(keepends=True)
             vertices.sort(key=lambda line: int(line.split(" ", 1)[0]))

@@ -148,11 +148,10 @@ def _sofa(center: FloatArray) -> Iterator[Rectangle]:
 def _chair(center: FloatArray, angle: float) -> Iterator[Rectangle]:
     """Yield a chair in front of the desk."""
     yield from _table(center, angle, (0.42, 0.42, 0.46), 0.04)
-    forward, _ = ground_axes(angle)
+    forward, right = ground_axes(angle)
     back = center - 0.19 * forward
     for bottom in (0.58, 0.74, 0.9):
         yield from box(back, angle, (0.03, 0.42, 0.09), plain("wood"), bottom=bottom)
-    _, right = ground_axes(angle)
     for side in (-0.19, 0.19):
         post = back + side * right
         yield from box(post, angle, (0.035, 0.035, 0.56), plain("wood"), bottom=0.46)
