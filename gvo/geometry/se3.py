@@ -211,12 +211,17 @@ def normalize(T: FloatArray) -> FloatArray:
     return make_transform(nearest_rotation(T[..., :3, :3]), T[..., :3, 3])
 
 
+def transport_covariance(covariance: FloatArray, T: FloatArray) -> FloatArray:
+    """Return the covariances (..., 6, 6) of Ad_T xi from those of xi, see `adjoint`."""
+    Ad = adjoint(T)
+    return np.asarray(Ad @ covariance @ np.swapaxes(Ad, -1, -2))
+
+
 def compose_covariance(
     covariance_a_b: FloatArray, T_b_c: FloatArray, covariance_b_c: FloatArray
 ) -> FloatArray:
     """Return the covariances (..., 6, 6) of T_a_b @ T_b_c, independent errors, first order."""
-    Ad = adjoint(invert(T_b_c))
-    moved = Ad @ covariance_a_b @ np.swapaxes(Ad, -1, -2)
+    moved = transport_covariance(covariance_a_b, invert(T_b_c))
     return np.asarray(
         0.5 * (moved + np.swapaxes(moved, -1, -2)) + covariance_b_c
     )  # symmetric in spite of rounding

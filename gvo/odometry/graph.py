@@ -189,11 +189,10 @@ class _Way(NamedTuple):
     def then(self, step: Edge) -> _Way:
         """Return the way to the next keyframe."""
         T_first_keyframe = self.T_first_keyframe @ step.T_reference_frame
-        Ad = se3.adjoint(T_first_keyframe)
         return _Way(
             T_first_keyframe,
-            self.covariance + Ad @ step.covariance @ Ad.T,
-            self.drift + Ad @ _drift(step, _DRIFT) @ Ad.T,
+            self.covariance + se3.transport_covariance(step.covariance, T_first_keyframe),
+            self.drift + se3.transport_covariance(_drift(step, _DRIFT), T_first_keyframe),
             self.n_steps + 1,
         )
 
@@ -203,8 +202,7 @@ class _Way(NamedTuple):
         covariance = np.sign(n_steps) * (self.covariance - other.covariance)
         if drifts:
             covariance = covariance + n_steps * (self.drift - other.drift)
-        Ad = se3.adjoint(se3.invert(self.T_first_keyframe))
-        return np.asarray(Ad @ covariance @ Ad.T)
+        return se3.transport_covariance(covariance, se3.invert(self.T_first_keyframe))
 
     def chi2(self, loop: Loop, before: _Way, *, drifts: bool) -> float:
         """Return by how much a loop to a keyframe before contradicts the way from there."""
@@ -590,8 +588,8 @@ class RunGraph:
         found = graph._variance_factor(loops) * optimizer.covariances()
         by_keyframe = dict(zip(graph._keyframes, found, strict=True))
         for stamp_ns, first_ns in firsts.items():
-            Ad = se3.adjoint(se3.invert(poses[stamp_ns]) @ poses[first_ns])
-            guessed = Ad @ graph._keyframes[first_ns].covariance @ Ad.T
+            T = se3.invert(poses[stamp_ns]) @ poses[first_ns]
+            guessed = se3.transport_covariance(graph._keyframes[first_ns].covariance, T)
             by_keyframe[stamp_ns] = by_keyframe[stamp_ns] + guessed
         return Optimum(
             estimates=graph._place(poses, by_keyframe),
@@ -779,10 +777,10 @@ class RunGraph:
         T_expected = T_starts @ first.T_reference_frame @ T_ends
         drift = other_end.covariance_since(end, drifts=True)
         covariance = se3.compose_covariance(first.covariance, T_ends, drift) + second.covariance
-        Ad = se3.adjoint(se3.invert(second.T_reference_frame))
         drift = other_start.covariance_since(start, drifts=True)
+        covariance += se3.transport_covariance(drift, se3.invert(second.T_reference_frame))
         difference = se3.log(se3.invert(T_expected) @ second.T_reference_frame)
-        return bool(se3.mahalanobis(difference, covariance + Ad @ drift @ Ad.T) <= INLIER_CHI2)
+        return bool(se3.mahalanobis(difference, covariance) <= INLIER_CHI2)
 
     def _variance_factor(self, loops: Sequence[Loop]) -> float:
         """Return how much more odometry drifts than its covariances say, 1 at least.

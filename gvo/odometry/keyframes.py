@@ -328,8 +328,8 @@ def misclosure(link: Edge, start: Estimate, end: Estimate) -> float:
         In sigmas of both; NaN where the covariances of the chain are too large to be subtracted.
     """
     T_start_end = se3.invert(start.T_world_frame) @ end.T_world_frame
-    Ad = se3.adjoint(se3.invert(T_start_end))
-    covariance = link.covariance + end.covariance - Ad @ start.covariance @ Ad.T
+    moved = se3.transport_covariance(start.covariance, se3.invert(T_start_end))
+    covariance = link.covariance + end.covariance - moved
     residual = se3.log(se3.invert(link.T_reference_frame) @ T_start_end)
     _, solved, info = dposv(covariance, residual)
     return float(residual @ solved) / len(residual) if info == 0 else math.nan

@@ -342,8 +342,7 @@ class Motions:
         T, stamps_ns = chain.T_world_frame, chain.stamps_ns
         C = np.zeros((len(chain), 6, 6)) if chain.covariances is None else chain.covariances
         T_start_end = se3.invert(T[first]) @ T[last]
-        Ad = se3.adjoint(se3.invert(T_start_end))
-        covariances = C[last] - Ad @ C[first] @ np.swapaxes(Ad, 1, 2)
+        covariances = C[last] - se3.transport_covariance(C[first], se3.invert(T_start_end))
         return cls(
             name=name,
             start_ns=stamps_ns[first],

@@ -204,8 +204,7 @@ class Trajectory:
         covariances = self.covariances
         if covariances is not None:
             # T exp(xi) B = T B exp(Ad(B^-1) xi)
-            Ad = se3.adjoint(se3.invert(T_frame_other))
-            covariances = Ad @ covariances @ Ad.T
+            covariances = se3.transport_covariance(covariances, se3.invert(T_frame_other))
         return replace(
             self, T_world_frame=self.T_world_frame @ T_frame_other, covariances=covariances
         )

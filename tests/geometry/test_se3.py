@@ -147,6 +147,14 @@ def random_covariance(rng: np.random.Generator, sigma: float) -> FloatArray:
     return np.asarray(factor @ factor.T)
 
 
+def test_a_transported_covariance_is_that_of_the_transported_twists() -> None:
+    rng = np.random.default_rng(6)
+    T, twists = se3.exp(rng.normal(size=(3, 6))), rng.normal(size=(3, 6, 20))
+    transported = np.stack([np.cov(each) for each in se3.adjoint(T) @ twists])
+    covariances = np.stack([np.cov(each) for each in twists])
+    np.testing.assert_allclose(se3.transport_covariance(covariances, T), transported, atol=1e-12)
+
+
 def test_composed_covariance_is_that_of_sampled_compositions() -> None:
     rng = np.random.default_rng(5)
     T_a_b, T_b_c = se3.exp(rng.normal(size=(2, 6)))

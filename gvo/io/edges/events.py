@@ -128,8 +128,7 @@ def inverted(edge: Edge, frame_id: FrameId) -> Edge:
     """
     T = edge.T_reference_frame
     # (T exp(d))^-1 = T^-1 exp(-Ad_T d)
-    Ad = se3.adjoint(T)
-    covariance = Ad @ edge.covariance @ Ad.T
+    covariance = se3.transport_covariance(edge.covariance, T)
     return Edge(
         reference_id=frame_id,
         T_reference_frame=se3.invert(T),

@@ -307,8 +307,7 @@ def step_covariance(before: PoseSample, after: PoseSample, sigma: StepSigma) -> 
         return sigma.covariance(T_a_b)
     if not _is_definite(after.covariance, scale=after.covariance):
         return sigma.covariance(T_a_b)
-    Ad = se3.adjoint(se3.invert(T_a_b))
-    moved = Ad @ before.covariance @ Ad.T
+    moved = se3.transport_covariance(before.covariance, se3.invert(T_a_b))
     growth = after.covariance - moved
     if _is_definite(growth, scale=after.covariance):
         return np.asarray(0.5 * (growth + growth.T))

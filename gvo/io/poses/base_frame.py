@@ -208,8 +208,7 @@ class BaseFrame:
         T_base_cam = self.T_base_cam(estimate.stamp_ns)
         T_camera = self._T_world_cam_first @ estimate.T_world_frame
         # T exp(xi) B = T B exp(Ad(B^-1) xi), with B = T_cam_frame
-        Ad = se3.adjoint(T_base_cam)
-        covariance = Ad @ estimate.covariance @ Ad.T
+        covariance = se3.transport_covariance(estimate.covariance, T_base_cam)
         return replace(
             estimate,
             T_world_frame=T_camera @ se3.invert(T_base_cam),
@@ -233,11 +232,10 @@ class BaseFrame:
         if self.is_camera:
             return edge
         start_ns = int(edge.reference_id)  # type: ignore[call-overload]
-        Ad = se3.adjoint(self.T_base_cam(stamp_ns))
         return replace(
             edge,
             T_reference_frame=self.apply_to_step(start_ns, stamp_ns, edge.T_reference_frame),
-            covariance=Ad @ edge.covariance @ Ad.T,
+            covariance=se3.transport_covariance(edge.covariance, self.T_base_cam(stamp_ns)),
         )
 
     def apply_to_loop(self, loop: Loop) -> Loop:

@@ -227,8 +227,8 @@ class RunMessages:
         is_step = last is not None and last.status == pose.status == Status.OK
         if not is_step or result.registration is None:
             return None
-        Ad = se3.adjoint(self._frames.mount(pose.stamp_ns))
-        return np.asarray(Ad @ result.registration.covariance @ Ad.T)
+        mount = self._frames.mount(pose.stamp_ns)
+        return se3.transport_covariance(result.registration.covariance, mount)
 
     def _write_odometry(
         self,
