@@ -395,13 +395,15 @@ class RigOffsets:
             Of the current frame.
         """
         is_new = self._last_ns is None or stamp_ns > self._last_ns
-        if is_new and DISPARITY in result.calibration_errors:
+        error = result.calibration_errors.get(DISPARITY)
+        if DISPARITY in self.learnt and is_new and error is not None:
             self._last_ns = stamp_ns
-            self._disparity_error = result.calibration_errors[DISPARITY]
+            self._disparity_error = error
 
-    def note_readout(self, error: ConstantError) -> None:
+    def note_readout(self, error: ConstantError, link: RelativePose) -> None:
         """Take what a link tells of the readout time, after the present value was subtracted."""
-        self._readout_errors.append(error)
+        # Matches that a wrong readout time contradicts are outliers, the others confirm it.
+        self._readout_errors.append(error.widened((link.n_matches / link.n_inliers) ** 2))
 
     def note_rows(self, row_px: float | None, stamp_ns: int) -> None:
         """Take the row offset of a frame; each frame counts once.
@@ -638,12 +640,13 @@ class CalibratedCamera:
             result = self._register(measured, config, hints)
         if isinstance(result, Failure):
             return result
-        if not is_step:
-            self._links[first.stamp_ns] = measured, result
-            return check_rows(result, self._camera)
-        if velocities.measured(second) is None:
+        if is_step and velocities.measured(second) is None:
             velocities.expect(first, second, result.T_reference_current)
-        self._learn_readout(first, config)
+        if READOUT in self._offsets.learnt:
+            if is_step:
+                self._learn_readout(first, config)
+            else:
+                self._links[first.stamp_ns] = measured, result
         return check_rows(result, self._camera)
 
     def _move_rows(
@@ -676,7 +679,6 @@ class CalibratedCamera:
         constants = result.calibration_errors
         error = self._offsets.velocities.error(measured.frames[0])
         T_correction = np.eye(4) if error is None else se3.exp(error)
-        first_pixels, second_pixels = (uvd[:, :2] for uvd in measured.uvd)
         by_learnt, by_velocity = self._covariances_by_constants(constants, measured.frames[1])
         return replace(
             result,
@@ -688,8 +690,8 @@ class CalibratedCamera:
                 for name, each in constants.items()
                 if name in self._offsets.learnt
             },
-            pixels_reference=first_pixels,
-            pixels_current=second_pixels,
+            pixels_reference=measured.uvd[0][:, :2],
+            pixels_current=measured.uvd[1][:, :2],
         )
 
     def _covariances_by_constants(
@@ -737,8 +739,7 @@ class CalibratedCamera:
         rates = pose_jacobian(corrected.target_points.T, self._camera)
         rates *= -readout_s * _row_times(corrected.target_uvd[:, 1], self._camera)
         rates *= sigmas[:, np.newaxis, np.newaxis]
-        still = np.zeros_like(rates)
-        both = np.swapaxes(np.stack([still, rates], axis=1), 2, 3)
+        both = np.swapaxes(np.stack([np.zeros_like(rates), rates], axis=1), 2, 3)
         return dict(zip(_VELOCITIES, both, strict=True))
 
     def _corrected(self, measured: Measurements) -> Correspondences:
@@ -776,14 +777,10 @@ class CalibratedCamera:
                 T, self._prepared(measured), self._camera, huber=config.registration.huber
             ).select(link.inliers)
             at = residuals.linearize(T)
-            if isinstance(at, Failure):
-                continue
-            error = estimate_constants(T, residuals, at).get(READOUT)
-            if error is not None:
-                # Matches that a wrong readout time contradicts are outliers, the others confirm it.
-                doubt = (link.n_matches / link.n_inliers) ** 2
-                error = error.times(self._offsets.readout.sigma).widened(doubt)
-                self._offsets.note_readout(error)
+            told = {} if isinstance(at, Failure) else estimate_constants(T, residuals, at)
+            if READOUT in told:
+                error = told[READOUT].times(self._offsets.readout.sigma)
+                self._offsets.note_readout(error, link)
         self._links = {}
 
     def _sensitivity(self, name: str, measured: Measurements) -> FloatArray:

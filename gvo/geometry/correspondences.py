@@ -26,8 +26,6 @@ class Correspondences:
     sensitivities : mapping of str to ndarray of float64, shape (2, n, 3)
         Derivatives of the measurements in source and target by the errors of constants of the
         camera that a registration is to estimate, by name; in units of their present sigmas.
-    expected : mapping of str to float
-        What these errors are expected to be, in the same units, where it is not zero.
     """
 
     source_points: FloatArray
@@ -37,7 +35,6 @@ class Correspondences:
     source_sigmas: FloatArray
     target_sigmas: FloatArray
     sensitivities: Mapping[str, FloatArray] = field(default_factory=dict)
-    expected: Mapping[str, float] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Return the number of correspondences."""

@@ -329,8 +329,7 @@ def estimate_constants(
 ) -> dict[str, ConstantError]:
     """Estimate the errors of constants of the camera, each beside the pose and the others.
 
-    Errors are in units of what is known of them: the others are around what is expected by a sigma
-    of one.
+    Errors are in units of what is known of them: the others are around zero by a sigma of one.
 
     The Jacobian is taken at the points as estimated from both frames. At the points as measured,
     the source's noise would be in the Jacobian and in the residuals alike, and bias the estimate
@@ -374,12 +373,10 @@ def estimate_constants(
     free = np.eye(len(scores))[told]
     known = np.eye(len(scores)) - free[:, np.newaxis] * free[:, :, np.newaxis]
     gains = np.linalg.solve(information + known, free[:, :, np.newaxis])[:, :, 0]
-    expected = np.array(residuals.expected)
-    values = gains @ np.sum(scores, axis=1) + np.einsum("mi,mij,j->m", gains, known, expected)
     variances = np.einsum("mi,mij,mj->m", gains, scores @ scores.T + known, gains)
     return {
         residuals.constants[k]: ConstantError(
             value=float(value), sigma=float(np.sqrt(variance)), effect=motion[:, k]
         )
-        for k, value, variance in zip(told, values, variances, strict=True)
+        for k, value, variance in zip(told, gains @ np.sum(scores, axis=1), variances, strict=True)
     }

@@ -139,15 +139,12 @@ class StereoResiduals:
         Threshold of the robust kernel, sigmas.
     constants : tuple of str
         Names of the k constants of the camera whose errors are to be estimated.
-    expected : tuple of float
-        What these errors are expected to be.
     """
 
     columns: FloatArray
     camera: StereoCamera
     huber: float
     constants: tuple[str, ...] = ()
-    expected: tuple[float, ...] = ()
 
     @classmethod
     def of(
@@ -169,10 +166,7 @@ class StereoResiduals:
         J = source_jacobian(T, columns[:3], camera)
         J *= matches.source_sigmas.T[:, np.newaxis]
         _write_factors(columns[6:12], J, matches.target_sigmas.T**2)
-        expected = tuple(matches.expected.get(name, 0.0) for name in constants)
-        return cls(
-            columns=columns, camera=camera, huber=huber, constants=constants, expected=expected
-        )
+        return cls(columns=columns, camera=camera, huber=huber, constants=constants)
 
     @property
     def source_points(self) -> FloatArray:

@@ -170,29 +170,56 @@ def test_an_offset_is_taken_off_but_for_what_lenses_and_edges_feign(true_px: flo
     assert offsets.disparity_px == pytest.approx(expected_px, abs=0.01)
 
 
-def test_the_readout_is_that_of_keyframes_where_there_are_any() -> None:
-    alone, with_keyframes = RigOffsets(config()), RigOffsets(config())
-    for offsets in (alone, with_keyframes):
-        offsets.note(result(readout_s=0.001), 10)
+def note_link(offsets: RigOffsets, readout_s: float, *, n_inliers: int = 20) -> None:
+    link = result(n_inliers=n_inliers, readout_s=readout_s)
+    offsets.note_readout(link.calibration_errors["readout_s"], link)
+
+
+def test_each_link_of_a_frame_tells_the_readout_that_was_not_known_when_it_was_made() -> None:
+    offsets = RigOffsets(config())
+    offsets.note(result(readout_s=0.001), 10)  # a step tells none
     for _ in range(2):
-        with_keyframes.note(result(readout_s=0.02), 10)
-    for offsets in (alone, with_keyframes):
-        offsets.advance()
-    assert 0.0009 < alone.readout.value <= 0.001
+        note_link(offsets, 0.02)
+    assert offsets.readout.value == 0.0
+    offsets.advance()
     # Both are of the value that was used, not of what the first one made of it.
-    assert 0.01 < with_keyframes.readout.value <= 0.02
-    assert with_keyframes.readout.sigma < 0.014
+    assert 0.01 < offsets.readout.value <= 0.02
+    assert offsets.readout.sigma < 0.014
 
 
 def test_a_registration_with_many_outliers_tells_less_of_the_readout() -> None:
     sure, doubtful = RigOffsets(config()), RigOffsets(config())
-    sure.note(result(readout_s=0.02), 10)
-    doubtful.note(result(n_inliers=10, readout_s=0.02), 10)
+    note_link(sure, 0.02)
+    note_link(doubtful, 0.02, n_inliers=10)
     for offsets in (sure, doubtful):
         offsets.advance()
     # Half of the matches: four times the sigma.
     information = [each.readout.sigma**-2 - 0.03**-2 for each in (sure, doubtful)]
     assert information[0] == pytest.approx(16.0 * information[1], rel=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["klt", "descriptor"])
+def test_a_link_tells_the_readout_once_the_next_step_is_known(kind: str) -> None:
+    recording = gvo.SyntheticRecording("turning", "rgbd", n_frames=12, seed=3, readout_ms=25.0)
+    settings = Config.model_validate({"frontend": {"kind": kind}})
+    frontend: Any = make_frontend(recording.info.camera, settings)
+    readout, poses = frontend.rig_offsets.readout, recording.ground_truth().T_world_frame
+    keyframe, *others = (frontend.extract(frame) for frame in frames_of(recording))
+    frames, values = [keyframe, *others], []
+    for k, (reference, current) in enumerate(pairwise(frames), start=1):
+        T = se3.invert(poses[k - 1]) @ poses[k]
+        frontend.register(reference, current, MotionPrior(T_predicted=T, T_recent=T))
+        frontend.rig_offsets.advance()
+        values.append(readout.value)
+        if k == 8:
+            T = se3.invert(poses[0]) @ poses[k]
+            link = frontend.register(keyframe, current, MotionPrior(T_predicted=T))
+            assert isinstance(link, RelativePose)
+            frontend.rig_offsets.advance()
+            assert readout.value == 0.0
+    # Steps tell nothing, neither before nor after; one link tells a part.
+    assert values[:8] == [0.0] * 8
+    assert 0.005 < values[8] == values[-1] < 0.03
 
 
 def test_nothing_is_learnt_where_it_is_switched_off() -> None:
