@@ -45,9 +45,8 @@ from gvo.types import (
 # Names of what registrations tell.
 DISPARITY, READOUT = "disparity_px", "readout_s"
 # Errors of registrations are correlated (the same walls, the same lens): their sigmas are too small
-# by these factors.
-_DISPARITY_FACTOR = 3.0
-_READOUT_FACTOR = 5.0
+# by this factor.
+_SIGMA_FACTOR = 3.0
 # What registrations are told to doubt besides.
 _VELOCITIES = tuple(f"velocity{axis}" for axis in range(6))
 # Change of the newest frame's velocity, relative to the last step, where that before is unknown;
@@ -427,13 +426,13 @@ class RigOffsets:
         if self._disparity_error is not None:
             error = self._disparity_error
             left_px = self.disparity_px + error.value - self.disparity.value
-            self.disparity.update(left_px, _DISPARITY_FACTOR * error.sigma)
+            self.disparity.update(left_px, _SIGMA_FACTOR * error.sigma)
         if self._row_px is not None:
             self.row.update(self._row_px - self.row.value, _ROW_SIGMA_PX)
         used_s = self.readout_s
         for error in self._readout_errors:
             left_s = used_s + error.value - self.readout.value
-            self.readout.update(left_s, _READOUT_FACTOR * error.sigma)
+            self.readout.update(left_s, _SIGMA_FACTOR * error.sigma)
         self._disparity_error, self._row_px, self._readout_errors = None, None, []
         note(
             "rig.offsets",
