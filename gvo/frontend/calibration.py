@@ -45,8 +45,9 @@ from gvo.types import (
 # Names of what registrations tell.
 DISPARITY, READOUT = "disparity_px", "readout_s"
 # Errors of registrations are correlated (the same walls, the same lens): their sigmas are too small
-# by this factor.
-_SIGMA_FACTOR = 3.0
+# by these factors.
+_DISPARITY_FACTOR = 3.0
+_READOUT_FACTOR = 5.0
 # What registrations are told to doubt besides.
 _VELOCITIES = tuple(f"velocity{axis}" for axis in range(6))
 # Change of the newest frame's velocity, relative to the last step, where that before is unknown;
@@ -399,10 +400,10 @@ class RigOffsets:
             self._last_ns = stamp_ns
             self._disparity_error = error
 
-    def note_readout(self, error: ConstantError, link: RelativePose) -> None:
-        """Take what a link tells of the readout time, after the present value was subtracted."""
+    def note_readout(self, error: ConstantError, result: RelativePose) -> None:
+        """Take what a registration tells of the readout, after the present value was subtracted."""
         # Matches that a wrong readout time contradicts are outliers, the others confirm it.
-        self._readout_errors.append(error.widened((link.n_matches / link.n_inliers) ** 2))
+        self._readout_errors.append(error.widened((result.n_matches / result.n_inliers) ** 2))
 
     def note_rows(self, row_px: float | None, stamp_ns: int) -> None:
         """Take the row offset of a frame; each frame counts once.
@@ -426,13 +427,13 @@ class RigOffsets:
         if self._disparity_error is not None:
             error = self._disparity_error
             left_px = self.disparity_px + error.value - self.disparity.value
-            self.disparity.update(left_px, _SIGMA_FACTOR * error.sigma)
+            self.disparity.update(left_px, _DISPARITY_FACTOR * error.sigma)
         if self._row_px is not None:
             self.row.update(self._row_px - self.row.value, _ROW_SIGMA_PX)
         used_s = self.readout_s
         for error in self._readout_errors:
             left_s = used_s + error.value - self.readout.value
-            self.readout.update(left_s, _SIGMA_FACTOR * error.sigma)
+            self.readout.update(left_s, _READOUT_FACTOR * error.sigma)
         self._disparity_error, self._row_px, self._readout_errors = None, None, []
         note(
             "rig.offsets",
@@ -588,8 +589,8 @@ class CalibratedCamera:
 
     def __init__(self, camera: StereoCamera, offsets: RigOffsets) -> None:
         self._camera, self._offsets = camera, offsets
-        # Of the newest frame, by the stamps of their keyframes.
-        self._links: dict[int, tuple[Measurements, RelativePose]] = {}
+        # Of the newest frame, its step first, by the stamps of their references.
+        self._registered: dict[int, tuple[Measurements, RelativePose]] = {}
 
     def correct(self, observations: Stamped, uvd: FloatArray) -> FloatArray:
         """Return measured (u, v, disparity), shape (n, 3), as a camera without errors has them."""
@@ -641,11 +642,9 @@ class CalibratedCamera:
             return result
         if is_step and velocities.measured(second) is None:
             velocities.expect(first, second, result.T_reference_current)
-        if READOUT in self._offsets.learnt:
-            if is_step:
-                self._learn_readout(first, config)
-            else:
-                self._links[first.stamp_ns] = measured, result
+        if is_step:
+            self._learn_readout(first, config)
+        self._registered[first.stamp_ns] = measured, result
         return check_rows(result, self._camera)
 
     def _move_rows(
@@ -763,24 +762,24 @@ class CalibratedCamera:
         return replace(corrected, sensitivities=sensitivities)
 
     def _learn_readout(self, frame: Stamped, config: Config) -> None:
-        """Take what the links of a frame tell, now that the step after it is known, too.
+        """Take what a frame tells of the readout, now that the step after it is known, too.
 
-        Keyframes tell the readout best, seen by a camera that moved another way. A velocity that is
-        extrapolated would not do: changes of velocity that are noise look like a shorter readout.
+        Keyframes tell it best, seen by a camera that moved another way; its step counts without
+        them. A velocity that is extrapolated would not do: changes of velocity that are noise look
+        like a shorter readout.
         """
-        for measured, link in self._links.values():
-            if measured.frames[1] is not frame:
-                continue
-            T = se3.invert(link.T_reference_current)
+        told_by = [each for each in self._registered.values() if each[0].frames[1] is frame]
+        self._registered = {}
+        for measured, result in (told_by[1:] or told_by) if READOUT in self._offsets.learnt else ():
+            T = se3.invert(result.T_reference_current)
             residuals = StereoResiduals.of(
                 T, self._prepared(measured), self._camera, huber=config.registration.huber
-            ).select(link.inliers)
+            ).select(result.inliers)
             at = residuals.linearize(T)
             told = {} if isinstance(at, Failure) else estimate_constants(T, residuals, at)
             if READOUT in told:
                 error = told[READOUT].times(self._offsets.readout.sigma)
-                self._offsets.note_readout(error, link)
-        self._links = {}
+                self._offsets.note_readout(error, result)
 
     def _sensitivity(self, name: str, measured: Measurements) -> FloatArray:
         """Return the derivatives of corrected measurements by an error of a constant."""
