@@ -43,7 +43,7 @@ class Limits:
 LIMITS = {
     KITTI: Limits(raw_ate_m=0.029, smoothed_ate_m=0.031, t_pct=0.78, path_error=0.002),
     EUROC: Limits(raw_ate_m=0.0046, smoothed_ate_m=0.0042),
-    XYZ: Limits(raw_ate_m=0.0098, smoothed_ate_m=0.0050),
+    XYZ: Limits(raw_ate_m=0.0085, smoothed_ate_m=0.0050),
     RPY: Limits(raw_ate_m=0.030, smoothed_ate_m=0.0080),
     ROOM: Limits(raw_ate_m=0.036, smoothed_ate_m=0.024, gain=0.85),
     DRIVE: Limits(raw_ate_m=0.0023, smoothed_ate_m=0.0021, t_pct=0.02, path_error=0.0002),
