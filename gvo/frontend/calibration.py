@@ -630,8 +630,7 @@ class CalibratedCamera:
         first, second = measured.frames
         hints: dict[str, Any] = {"stamps_ns": (first.stamp_ns, second.stamp_ns), "prior": prior}
         # A first step has no velocity yet to start from.
-        is_known = velocities.of(first) is not None
-        if is_step and is_known and self._offsets.possible_readout_s != 0.0:
+        if is_step and velocities.of(first) is not None and self._offsets.possible_readout_s:
             hints["T_start"] = self._move_rows(measured, config, hints)
         result = self._register(measured, config, hints)
         if isinstance(result, Failure) and hints.pop("T_start", None) is not None:
@@ -778,8 +777,8 @@ class CalibratedCamera:
             at = residuals.linearize(T)
             told = {} if isinstance(at, Failure) else estimate_constants(T, residuals, at)
             if READOUT in told:
-                error = told[READOUT].times(self._offsets.readout.sigma)
-                self._offsets.note_readout(error, result)
+                sigma_s = self._offsets.readout.sigma
+                self._offsets.note_readout(told[READOUT].times(sigma_s), result)
 
     def _sensitivity(self, name: str, measured: Measurements) -> FloatArray:
         """Return the derivatives of corrected measurements by an error of a constant."""

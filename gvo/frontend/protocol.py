@@ -232,6 +232,7 @@ def find_fault(result: RelativePose) -> str:
     for name, array, shape in (
         ("T_reference_current", T, (4, 4)),
         ("the covariance", covariance, (6, 6)),
+        ("the passing covariance", result.passing_covariance, (6, 6)),
     ):
         if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:
             return f"{name} is no array of float64 of shape {shape}"
@@ -239,4 +240,7 @@ def find_fault(result: RelativePose) -> str:
     if fault:
         return f"T_reference_current {fault}"
     fault = se3.covariance_fault(covariance)
-    return f"the covariance {fault}" if fault else ""
+    if fault:
+        return f"the covariance {fault}"
+    fault = se3.covariance_fault(covariance - result.passing_covariance)
+    return f"the covariance without what passes {fault}" if fault else ""

@@ -58,6 +58,8 @@ def test_covariances_of_any_correlation_will_do(value: float) -> None:
         ({"covariance": correlated(1.0)}, "not positive definite"),
         ({"covariance": correlated(2.0)}, "not positive definite"),
         ({"covariance": np.triu(correlated(0.5))}, "not symmetric"),
+        ({"passing_covariance": np.eye(3)}, "the passing covariance is no array"),
+        ({"passing_covariance": COVARIANCE}, "without what passes is not positive definite"),
     ],
 )
 def test_a_fault_is_named(changes: dict[str, Any], fault: str) -> None:

@@ -29,9 +29,12 @@ def observe(stamp_ns: int) -> Observations:
 class TrueFrontend:
     """Registers frames at known poses, but those of `blank`; remembers what it was asked."""
 
-    def __init__(self, pose: Callable[[int], FloatArray], blank: set[int]) -> None:
+    def __init__(
+        self, pose: Callable[[int], FloatArray], blank: set[int], passing_share: float = 0.0
+    ) -> None:
         self._pose = pose
         self._blank = blank
+        self._passing_share = passing_share
         self.asked: list[tuple[int, int, MotionPrior | None]] = []
 
     def extract(self, frame: Observations) -> Observations:
@@ -47,6 +50,7 @@ class TrueFrontend:
         return RelativePose(
             T_reference_current=np.linalg.inv(self._pose(a)) @ self._pose(b),
             covariance=COVARIANCE,
+            passing_covariance=self._passing_share * COVARIANCE,
             matches=np.zeros((9, 2), dtype=np.int64),
             inliers=np.arange(9) < 7,
         )
@@ -83,6 +87,15 @@ def run(
 
 def stamps_of(n: int, start: int = 0) -> list[int]:
     return [start + STEP_NS * i for i in range(n)]
+
+
+def test_what_passes_with_the_next_step_does_not_add_up() -> None:
+    chains = [RawChain(TrueFrontend(steady, set(), share), SETTINGS) for share in (0.75, 0.0)]
+    steps = [[chain.advance(observe(stamp)) for stamp in stamps_of(4)] for chain in chains]
+    for part, every in zip(*steps, strict=True):
+        np.testing.assert_allclose(part.estimate.covariance, 0.25 * every.estimate.covariance)
+    # A step is measured as well as it says.
+    np.testing.assert_array_equal(steps[0][-1].edge.covariance, COVARIANCE)
 
 
 def test_the_first_frame_is_the_world() -> None:

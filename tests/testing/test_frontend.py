@@ -68,7 +68,11 @@ def spoil_pose(change: Callable[[FloatArray], FloatArray]) -> Spoilt:
 
 
 def spoil_covariance(change: Callable[[FloatArray], FloatArray]) -> Spoilt:
-    return spoil_found(lambda found: replace(found, covariance=change(found.covariance)))
+    return spoil_found(
+        lambda found: replace(
+            found, covariance=change(found.covariance), passing_covariance=np.zeros((6, 6))
+        )
+    )
 
 
 def spoil_failure(change: Callable[[MotionPrior | None], Result]) -> Spoilt:
