@@ -641,9 +641,10 @@ class CalibratedCamera:
             return result
         if is_step and velocities.measured(second) is None:
             velocities.expect(first, second, result.T_reference_current)
-        if is_step:
-            self._learn_readout(first, config)
-        self._registered[first.stamp_ns] = measured, result
+        if READOUT in self._offsets.learnt:
+            if is_step:
+                self._learn_readout(first, config)
+            self._registered[first.stamp_ns] = measured, result
         return check_rows(result, self._camera)
 
     def _move_rows(
@@ -769,7 +770,7 @@ class CalibratedCamera:
         """
         told_by = [each for each in self._registered.values() if each[0].frames[1] is frame]
         self._registered = {}
-        for measured, result in (told_by[1:] or told_by) if READOUT in self._offsets.learnt else ():
+        for measured, result in told_by[1:] or told_by:
             T = se3.invert(result.T_reference_current)
             residuals = StereoResiduals.of(
                 T, self._prepared(measured), self._camera, huber=config.registration.huber
@@ -777,8 +778,7 @@ class CalibratedCamera:
             at = residuals.linearize(T)
             told = {} if isinstance(at, Failure) else estimate_constants(T, residuals, at)
             if READOUT in told:
-                sigma_s = self._offsets.readout.sigma
-                self._offsets.note_readout(told[READOUT].times(sigma_s), result)
+                self._offsets.note_readout(told[READOUT].times(self._offsets.readout.sigma), result)
 
     def _sensitivity(self, name: str, measured: Measurements) -> FloatArray:
         """Return the derivatives of corrected measurements by an error of a constant."""
