@@ -290,7 +290,7 @@ class ConstantError:
         return replace(self, sigma=factor * self.sigma)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
 class RelativePose:
     """A registration's result.
 

@@ -589,8 +589,11 @@ class CalibratedCamera:
 
     def __init__(self, camera: StereoCamera, offsets: RigOffsets) -> None:
         self._camera, self._offsets = camera, offsets
-        # Of the newest frame, its step first, by the stamps of their references.
-        self._registered: dict[int, tuple[Measurements, RelativePose]] = {}
+        # Measurements of registrations that are not accepted yet, and whether they are of a step.
+        self._offered: WeakKeyDictionary[RelativePose, tuple[Measurements, bool]]
+        self._offered = WeakKeyDictionary()
+        # Those of the newest frame, its step first.
+        self._accepted: list[tuple[Measurements, RelativePose]] = []
 
     def correct(self, observations: Stamped, uvd: FloatArray) -> FloatArray:
         """Return measured (u, v, disparity), shape (n, 3), as a camera without errors has them."""
@@ -641,11 +644,20 @@ class CalibratedCamera:
             return result
         if is_step and velocities.measured(second) is None:
             velocities.expect(first, second, result.T_reference_current)
-        if READOUT in self._offsets.learnt:
-            if is_step:
-                self._learn_readout(first, config)
-            self._registered[first.stamp_ns] = measured, result
+        self._offered[result] = measured, is_step
         return check_rows(result, self._camera)
+
+    def accept(self, result: RelativePose, config: Config) -> None:
+        """Learn from a registration that passed all checks; from the others nothing is learnt."""
+        measured, is_step = self._offered[result]
+        self._offered.clear()
+        first, second = measured.frames
+        self._offsets.note(result, second.stamp_ns)
+        if READOUT not in self._offsets.learnt:
+            return
+        if is_step:
+            self._learn_readout(first, config)
+        self._accepted.append((measured, result))
 
     def _move_rows(
         self, measured: Measurements, config: Config, hints: Mapping[str, Any]
@@ -768,8 +780,8 @@ class CalibratedCamera:
         them. A velocity that is extrapolated would not do: changes of velocity that are noise look
         like a shorter readout.
         """
-        told_by = [each for each in self._registered.values() if each[0].frames[1] is frame]
-        self._registered = {}
+        told_by = [each for each in self._accepted if each[0].frames[1] is frame]
+        self._accepted = []
         for measured, result in told_by[1:] or told_by:
             T = se3.invert(result.T_reference_current)
             residuals = StereoResiduals.of(

@@ -150,7 +150,7 @@ class DescriptorFrontend:
         """
         result = self._register(reference, current, prior)
         if isinstance(result, RelativePose):
-            self.rig_offsets.note(result, current.stamp_ns)
+            self._calibrated.accept(result, self._config)
         return result
 
     def _register(

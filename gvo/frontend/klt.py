@@ -171,7 +171,7 @@ class KltFrontend:
         if isinstance(result, RelativePose):
             result = self._check_depth(reference, current, result)
         if isinstance(result, RelativePose):
-            self.rig_offsets.note(result, current.stamp_ns)
+            self._calibrated.accept(result, self._config)
             row_px = reference.corners.row_px
             self.rig_offsets.note_rows(row_px, reference.stamp_ns)
         return result
