@@ -681,7 +681,11 @@ class CalibratedCamera:
     def _register(
         self, measured: Measurements, config: Config, hints: Mapping[str, Any]
     ) -> RelativePose | Failure:
-        prepared = self._prepared(measured)
+        # A step that was adjusted tells what the velocity does to it.
+        told = None
+        if hints.get("T_start") is not None:
+            told = self._offsets.velocities.measured(measured.frames[1])
+        prepared = self._prepared(measured, is_adjusted=told is not None)
         result = register_correspondences(prepared, measured.matches, self._camera, config, **hints)
         if isinstance(result, Failure):
             return result
@@ -689,11 +693,15 @@ class CalibratedCamera:
         constants = result.calibration_errors
         error = self._offsets.velocities.error(measured.frames[0])
         T_correction = np.eye(4) if error is None else se3.exp(error)
-        by_learnt, by_velocity = self._covariances_by_constants(constants, measured.frames[1])
+        effects = [each.effect for name, each in constants.items() if name not in _VELOCITIES]
+        by_learnt = np.array(effects).reshape(-1, 6)
+        by_velocity = self._covariance_by_velocity(constants, measured.frames[1], told)
         return replace(
             result,
             T_reference_current=T_correction @ result.T_reference_current,
-            covariance=measured.sigma_factor**2 * result.covariance + by_learnt + by_velocity,
+            covariance=measured.sigma_factor**2 * result.covariance
+            + by_learnt.T @ by_learnt
+            + by_velocity,
             passing_covariance=by_velocity,
             calibration_errors={
                 name: each.times(self._offsets.learnt[name].sigma)
@@ -704,17 +712,21 @@ class CalibratedCamera:
             pixels_current=measured.uvd[1][:, :2],
         )
 
-    def _covariances_by_constants(
-        self, constants: Mapping[str, ConstantError], current: Stamped
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return covariances of a pose, shape (6, 6), by what is learnt and by the velocity."""
+    def _covariance_by_velocity(
+        self,
+        constants: Mapping[str, ConstantError],
+        current: Stamped,
+        adjusted: MeasuredVelocity | None,
+    ) -> FloatArray:
+        """Return the covariance of a pose, shape (6, 6), by what is in doubt of the velocity."""
         told = self._offsets.velocities.measured(current)
         known = np.eye(len(_VELOCITIES)) if told is None else told.found.covariance
         axes = [n for n, name in enumerate(_VELOCITIES) if name in constants]
         by_axis = np.array([constants[_VELOCITIES[n]].effect for n in axes]).reshape(-1, 6)
-        learnt = [each.effect for name, each in constants.items() if name not in _VELOCITIES]
-        by_learnt = np.array(learnt).reshape(-1, 6)
-        return by_learnt.T @ by_learnt, by_axis.T @ known[np.ix_(axes, axes)] @ by_axis
+        if adjusted is not None:
+            axes, by_axis = [*range(len(known))], adjusted.found.effects.T
+        covariance = by_axis.T @ known[np.ix_(axes, axes)] @ by_axis
+        return np.asarray(0.5 * (covariance + covariance.T))
 
     def _measure_velocity(
         self, measured: Measurements, T: FloatArray, config: Config
@@ -759,7 +771,7 @@ class CalibratedCamera:
         note("rows.settled", measured=measured.uvd[1] - self._offset(), settled=current)
         return Correspondences.of_pixels((reference, current), measured.sigmas, self._camera)
 
-    def _prepared(self, measured: Measurements) -> Correspondences:
+    def _prepared(self, measured: Measurements, *, is_adjusted: bool = False) -> Correspondences:
         """Return what was measured, corrected, with its derivatives by what is in doubt."""
         corrected = self._corrected(measured)
         sensitivities = {
@@ -769,7 +781,7 @@ class CalibratedCamera:
         sigmas = self._offsets.velocities.sigmas(measured.frames[1])
         # What a readout that is not known yet may do counts, too.
         readout_s = self._offsets.possible_readout_s
-        if sigmas is not None and readout_s != 0.0:
+        if sigmas is not None and readout_s != 0.0 and not is_adjusted:
             sensitivities |= self._by_velocity(corrected, sigmas, readout_s)
         return replace(corrected, sensitivities=sensitivities)
 
@@ -777,12 +789,13 @@ class CalibratedCamera:
         """Take what a frame tells of the readout, now that the step after it is known, too.
 
         Keyframes tell it best, seen by a camera that moved another way; its step counts without
-        them. A velocity that is extrapolated would not do: changes of velocity that are noise look
+        them, until the readout is known to take no time. A velocity that is extrapolated would not do: changes of velocity that are noise look
         like a shorter readout.
         """
         told_by = [each for each in self._accepted if each[0].frames[1] is frame]
         self._accepted = []
-        for measured, result in told_by[1:] or told_by:
+        links = told_by[1:]
+        for measured, result in links or (told_by if self._offsets.possible_readout_s else ()):
             T = se3.invert(result.T_reference_current)
             residuals = StereoResiduals.of(
                 T, self._prepared(measured), self._camera, huber=config.registration.huber

@@ -35,6 +35,8 @@ from gvo.types import (
 _MIN_KNOWN_SHARE = 0.7
 # Gauss-Newton steps of a rough estimate.
 _N_ROUGH_ITERATIONS = 2
+# By how much more its inliers may be off: rows are bent by a velocity that is not measured yet.
+_ROUGH_FACTOR = 2.0
 # Best over second best distance of a match (D. Lowe, 2004, doi:10.1023/B:VISI.0000029664.99615.94).
 _MAX_RATIO = 0.8
 # More RANSAC hypotheses: more matches are wrong than between neighbouring frames.
@@ -123,6 +125,12 @@ def estimate_roughly(
     prior: MotionPrior | None,
 ) -> FloatArray | Failure:
     """Return T_target_source after a few steps, not verified; as `register_correspondences`."""
+    ransac = config.ransac
+    wide = {
+        "inlier_threshold_px": _ROUGH_FACTOR * ransac.inlier_threshold_px,
+        "inlier_threshold_m": _ROUGH_FACTOR * ransac.inlier_threshold_m,
+    }
+    config = config.model_copy(update={"ransac": ransac.model_copy(update=wide)})
     T = None if prior is None else se3.invert(prior.T_predicted)
     known = _known_consensus(T, correspondences, camera, config)
     found = known or search_consensus(correspondences, camera, config, stamps_ns)
