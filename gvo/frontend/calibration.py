@@ -342,7 +342,6 @@ class RigOffsets:
         self._disparity_error: ConstantError | None = None
         self._readout_errors: list[ConstantError] = []
         self._row_px: float | None = None
-        self._last_ns: int | None = None
         self._last_row_ns: int | None = None
 
     @property
@@ -366,13 +365,9 @@ class RigOffsets:
     @property
     def possible_readout_s(self) -> float:
         """How long the readout may be, seconds: zero where it is known to take no time."""
-        is_possible = self.readout_s != 0.0 or self.readout.sigma > _LEAST_READOUT_S
+        longest_s = abs(self.readout.value) + self.readout.sigma
+        is_possible = self.readout_s != 0.0 or longest_s > _LEAST_READOUT_S
         return math.hypot(self.readout_s, self.readout.sigma) if is_possible else 0.0
-
-    @property
-    def is_learning(self) -> bool:
-        """Tell whether anything is learnt."""
-        return bool(self.learnt)
 
     def reconfigure(self, config: Config) -> None:
         """Forget the variance factors where another front-end states other covariances."""
@@ -382,23 +377,9 @@ class RigOffsets:
             self._sigma_factor = sigma_factor
             self.chain_factor, self.window_factor = map(VarianceFactor, [sigma_factor] * 2)
 
-    def note(self, result: RelativePose, stamp_ns: int) -> None:
-        """Take what a registration tells.
-
-        The first of each frame, its step, counts for the offset of the disparities.
-
-        Parameters
-        ----------
-        result : RelativePose
-            With `calibration_errors`, after the present values were subtracted.
-        stamp_ns : int
-            Of the current frame.
-        """
-        is_new = self._last_ns is None or stamp_ns > self._last_ns
-        error = result.calibration_errors.get(DISPARITY)
-        if DISPARITY in self.learnt and is_new and error is not None:
-            self._last_ns = stamp_ns
-            self._disparity_error = error
+    def note_disparity(self, error: ConstantError | None) -> None:
+        """Take what a step tells of the disparities, after the present value was subtracted."""
+        self._disparity_error = error
 
     def note_readout(self, error: ConstantError, result: RelativePose) -> None:
         """Take what a registration tells of the readout, after the present value was subtracted."""
@@ -589,9 +570,8 @@ class CalibratedCamera:
 
     def __init__(self, camera: StereoCamera, offsets: RigOffsets) -> None:
         self._camera, self._offsets = camera, offsets
-        # Measurements of registrations that are not accepted yet, and whether they are of a step.
-        self._offered: WeakKeyDictionary[RelativePose, tuple[Measurements, bool]]
-        self._offered = WeakKeyDictionary()
+        # Measurements of registrations that are not accepted yet.
+        self._offered = WeakKeyDictionary[RelativePose, Measurements]()
         # Those of the newest frame, its step first.
         self._accepted: list[tuple[Measurements, RelativePose]] = []
 
@@ -644,20 +624,18 @@ class CalibratedCamera:
             return result
         if is_step and velocities.measured(second) is None:
             velocities.expect(first, second, result.T_reference_current)
-        self._offered[result] = measured, is_step
+        self._offered[result] = measured
         return check_rows(result, self._camera)
 
-    def accept(self, result: RelativePose, config: Config) -> None:
+    def accept(self, result: RelativePose, config: Config, *, is_step: bool) -> None:
         """Learn from a registration that passed all checks; from the others nothing is learnt."""
-        measured, is_step = self._offered[result]
+        measured = self._offered[result]
         self._offered.clear()
-        first, second = measured.frames
-        self._offsets.note(result, second.stamp_ns)
-        if READOUT not in self._offsets.learnt:
-            return
         if is_step:
-            self._learn_readout(first, config)
-        self._accepted.append((measured, result))
+            self._offsets.note_disparity(result.calibration_errors.get(DISPARITY))
+            self._learn_readout(measured.frames[0], config)
+        if READOUT in self._offsets.learnt:
+            self._accepted.append((measured, result))
 
     def _move_rows(
         self, measured: Measurements, config: Config, hints: Mapping[str, Any]
@@ -681,21 +659,26 @@ class CalibratedCamera:
     def _register(
         self, measured: Measurements, config: Config, hints: Mapping[str, Any]
     ) -> RelativePose | Failure:
-        # A step that was adjusted tells what the velocity does to it.
-        told = None
-        if hints.get("T_start") is not None:
-            told = self._offsets.velocities.measured(measured.frames[1])
-        prepared = self._prepared(measured, is_adjusted=told is not None)
+        told = self._offsets.velocities.measured(measured.frames[1])
+        # A step that was adjusted with it knows already what the velocity does to it.
+        is_adjusted = told is not None and hints.get("T_start") is not None
+        prepared = self._prepared(measured, is_adjusted=is_adjusted)
         result = register_correspondences(prepared, measured.matches, self._camera, config, **hints)
         if isinstance(result, Failure):
             return result
-        # In sigmas of what is known of each constant, as the sensitivities are.
-        constants = result.calibration_errors
         error = self._offsets.velocities.error(measured.frames[0])
         T_correction = np.eye(4) if error is None else se3.exp(error)
-        effects = [each.effect for name, each in constants.items() if name not in _VELOCITIES]
-        by_learnt = np.array(effects).reshape(-1, 6)
-        by_velocity = self._covariance_by_velocity(constants, measured.frames[1], told)
+        # In sigmas of what is known of each constant, as the sensitivities are.
+        constants = result.calibration_errors
+        effects = {name: np.zeros(6) for name in (DISPARITY, READOUT, *_VELOCITIES)}
+        effects |= {name: each.effect for name, each in constants.items()}
+        by_learnt, by_axis = np.split(np.array([*effects.values()]), [2])
+        known = np.eye(len(by_axis))
+        if told is not None:
+            known = told.found.covariance
+            by_axis = told.found.effects.T if is_adjusted else by_axis
+        by_velocity = by_axis.T @ known @ by_axis
+        by_velocity = 0.5 * (by_velocity + by_velocity.T)  # symmetric in spite of rounding
         return replace(
             result,
             T_reference_current=T_correction @ result.T_reference_current,
@@ -711,22 +694,6 @@ class CalibratedCamera:
             pixels_reference=measured.uvd[0][:, :2],
             pixels_current=measured.uvd[1][:, :2],
         )
-
-    def _covariance_by_velocity(
-        self,
-        constants: Mapping[str, ConstantError],
-        current: Stamped,
-        adjusted: MeasuredVelocity | None,
-    ) -> FloatArray:
-        """Return the covariance of a pose, shape (6, 6), by what is in doubt of the velocity."""
-        told = self._offsets.velocities.measured(current)
-        known = np.eye(len(_VELOCITIES)) if told is None else told.found.covariance
-        axes = [n for n, name in enumerate(_VELOCITIES) if name in constants]
-        by_axis = np.array([constants[_VELOCITIES[n]].effect for n in axes]).reshape(-1, 6)
-        if adjusted is not None:
-            axes, by_axis = [*range(len(known))], adjusted.found.effects.T
-        covariance = by_axis.T @ known[np.ix_(axes, axes)] @ by_axis
-        return np.asarray(0.5 * (covariance + covariance.T))
 
     def _measure_velocity(
         self, measured: Measurements, T: FloatArray, config: Config
@@ -789,8 +756,8 @@ class CalibratedCamera:
         """Take what a frame tells of the readout, now that the step after it is known, too.
 
         Keyframes tell it best, seen by a camera that moved another way; its step counts without
-        them, until the readout is known to take no time. A velocity that is extrapolated would not do: changes of velocity that are noise look
-        like a shorter readout.
+        them, until the readout is known to take no time. A velocity that is extrapolated would not
+        do: changes of velocity that are noise look like a shorter readout.
         """
         told_by = [each for each in self._accepted if each[0].frames[1] is frame]
         self._accepted = []

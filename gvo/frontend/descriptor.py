@@ -150,7 +150,8 @@ class DescriptorFrontend:
         """
         result = self._register(reference, current, prior)
         if isinstance(result, RelativePose):
-            self._calibrated.accept(result, self._config)
+            is_step = prior is None or prior.T_recent is not None
+            self._calibrated.accept(result, self._config, is_step=is_step)
         return result
 
     def _register(

@@ -114,7 +114,7 @@ class KltFrontend:
         return KltObservations(frame=frame, half=half, corners=corners)
 
     def _find_corners(self, frame: Frame, half: ImageArray, klt: KltConfig) -> KltCorners:
-        offset_px, row_offset_px = self._offsets_px()
+        offset_px, row_offset_px = self.rig_offsets.disparity_px, self.rig_offsets.row.value
         corners = detect_corners(image_of(frame), klt, half=half)
         row_px = None
         if isinstance(frame, StereoFrame):
@@ -143,10 +143,6 @@ class KltFrontend:
             templates=Templates.of(image_of(frame), keypoints),
         )
 
-    def _offsets_px(self) -> tuple[float, float]:
-        """Return the offsets of disparities and of rows of the right image."""
-        return self.rig_offsets.disparity_px, self.rig_offsets.row.value
-
     def register(
         self, reference: KltObservations, current: KltObservations, prior: MotionPrior | None = None
     ) -> RelativePose | Failure:
@@ -171,9 +167,9 @@ class KltFrontend:
         if isinstance(result, RelativePose):
             result = self._check_depth(reference, current, result)
         if isinstance(result, RelativePose):
-            self._calibrated.accept(result, self._config)
-            row_px = reference.corners.row_px
-            self.rig_offsets.note_rows(row_px, reference.stamp_ns)
+            is_step = prior is None or prior.T_recent is not None
+            self._calibrated.accept(result, self._config, is_step=is_step)
+            self.rig_offsets.note_rows(reference.corners.row_px, reference.stamp_ns)
         return result
 
     def _register(
@@ -338,7 +334,7 @@ class KltFrontend:
         """Register by descriptors, which match corners that moved too far for a track."""
         first, second = (self._as_observations(place) for place in (reference, current))
         matches = match_anywhere(reference.descriptors, current.descriptors)
-        offset_px = self._offsets_px()[0]
+        offset_px = self.rig_offsets.disparity_px
         return register_anywhere(
             first, second, matches, self.camera, self._config, offset_px=offset_px
         )
@@ -515,7 +511,7 @@ class KltFrontend:
         if isinstance(frame, RgbdFrame):
             return self._measure_depth(frame, pixels)
         config, images = self._config.stereo, (frame.left, frame.right)
-        offset_px, row_offset_px = self._offsets_px()
+        offset_px, row_offset_px = self.rig_offsets.disparity_px, self.rig_offsets.row.value
         follow = partial(follow_disparities, n_steps=_N_TRACK_STEPS, slopes=expected.slopes)
         measure = measure_disparities if search == "wide" else follow
         disparities, is_valid = measure(

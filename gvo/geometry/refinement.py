@@ -204,32 +204,23 @@ def adjust(
     T = T_target_source
     J_constants, _ = residuals.sensitivities(T, residuals.source_points)
     k, weight = len(J_constants), sigma_factor**2
-    values, flat, H = np.zeros(k), np.zeros((6 + k, 0)), np.eye(6 + k)
-    max_gain = _SHORT**2 * residuals.columns.shape[1]
-    near: Linearization | None = None
+    values, H = np.zeros(k), np.eye(6 + k)
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(n_iterations):
-            left = residuals.without(np.einsum("kin,k->in", J_constants, values))
-            at = left.linearize(T, near)
+            at = residuals.without(np.einsum("kin,k->in", J_constants, values)).linearize(T)
             if isinstance(at, Failure):
                 return None
-            if near is None:
-                rows = np.concatenate([at.J, J_constants])
-                whiten_in_place(at.factors, rows[6:])
-                flat = rows.reshape(6 + k, -1)
-                H = flat @ flat.T
-                H[6:, 6:] += weight * np.eye(k)
-            g = flat @ at.r.ravel()
+            rows = np.concatenate([at.J, J_constants])
+            whiten_in_place(at.factors, rows[6:])
+            flat = rows.reshape(6 + k, -1)
+            H, g = flat @ flat.T, flat @ at.r.ravel()
+            H[6:, 6:] += weight * np.eye(k)
             g[6:] -= weight * values
             _, step, info = dposv(H, g)
             if info != 0 or not np.isfinite(step).all():
                 return None
             T = se3.make_transform(cv2.Rodrigues(step[:3])[0], step[3:6]) @ T
             values = values + step[6:]
-            gain = step @ g
-            if gain < _CONVERGED:
-                break
-            near = at if gain < max_gain else None
     return Adjustment(
         T_target_source=se3.normalize(T),
         values=values,

@@ -129,7 +129,7 @@ class Odometry:
     def rig_offsets(self) -> RigOffsets | None:
         """What is learnt of the camera, calibrated online; None where nothing is."""
         offsets = self._frontend.rig_offsets
-        return offsets if offsets is not None and offsets.is_learning else None
+        return offsets if offsets is not None and offsets.learnt else None
 
     def reconfigure(self, config: Config) -> None:
         """Change the configuration from the next frame on.

@@ -16,6 +16,7 @@ from scipy.optimize import brentq
 
 import gvo
 from gvo.config import Config
+from gvo.frontend import klt
 from gvo.frontend.calibration import (
     ConstantFilter,
     FrameVelocities,
@@ -34,6 +35,7 @@ from gvo.io.recording import Sensor
 from gvo.io.synthetic.recording import SensorNoise
 from gvo.types import (
     ConstantError,
+    Failure,
     FaultyFrame,
     FloatArray,
     Frame,
@@ -133,10 +135,7 @@ def test_one_misfit_far_off_does_not_undo_what_many_showed() -> None:
 
 def test_what_is_noted_counts_from_the_next_frame_and_once() -> None:
     offsets = RigOffsets(config())
-    offsets.note(result(disparity_px=0.1), 10)
-    offsets.note(result(disparity_px=-5.0), 10)  # a link of the same frame
-    offsets.note(result(disparity_px=-5.0), 9)
-    offsets.note(result(), 11)
+    offsets.note_disparity(result(disparity_px=0.1).calibration_errors["disparity_px"])
     offsets.note_rows(0.2, 10)
     offsets.note_rows(-5.0, 10)
     offsets.note_rows(None, 11)
@@ -158,12 +157,11 @@ def test_what_is_noted_counts_from_the_next_frame_and_once() -> None:
 @pytest.mark.parametrize("true_px", [-0.3, -0.04, 0.0, 0.03, 0.2])
 def test_an_offset_is_taken_off_but_for_what_lenses_and_edges_feign(true_px: float) -> None:
     offsets = RigOffsets(config())
-    for stamp_ns in range(200):
+    for _ in range(200):
         # What is left of it after the present value was subtracted.
         left_px = true_px - offsets.disparity_px
         error = ConstantError(value=left_px, sigma=0.01, effect=np.zeros(6))
-        noted = replace(result(), calibration_errors={"disparity_px": error})
-        offsets.note(noted, stamp_ns)
+        offsets.note_disparity(error)
         offsets.advance()
     assert offsets.disparity.value == pytest.approx(true_px, abs=0.01)
     expected_px = np.sign(true_px) * max(abs(true_px) - 0.05, 0.0)
@@ -177,7 +175,6 @@ def note_link(offsets: RigOffsets, readout_s: float, *, n_inliers: int = 20) -> 
 
 def test_each_link_of_a_frame_tells_the_readout_that_was_not_known_when_it_was_made() -> None:
     offsets = RigOffsets(config())
-    offsets.note(result(readout_s=0.001), 10)  # a step tells none
     for _ in range(2):
         note_link(offsets, 0.02)
     assert offsets.readout.value == 0.0
@@ -223,12 +220,45 @@ def test_a_frame_tells_the_readout_once_the_next_step_is_known(kind: str) -> Non
     assert error_s[-1] < (0.0015 if kind == "klt" else 0.01)
 
 
+@pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
+def test_what_is_refused_and_loops_tell_nothing_of_the_camera(
+    sensor: Sensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = gvo.SyntheticRecording("turning", sensor, n_frames=9, seed=3, readout_ms=25.0)
+    poses = recording.ground_truth().T_world_frame
+
+    def refuse(result: RelativePose, *_: object) -> Failure:
+        assert isinstance(result, RelativePose)
+        return Failure(reason="refused")
+
+    def learnt(also: str) -> list[float]:
+        frontend: Any = make_frontend(recording.info.camera, Config())
+        frames = [frontend.extract(frame) for frame in frames_of(recording)]
+        for k, (reference, current) in enumerate(pairwise(frames), start=1):
+            T = se3.invert(poses[k - 1]) @ poses[k]
+            frontend.register(reference, current, MotionPrior(T_predicted=T, T_recent=T))
+            T = se3.invert(poses[0]) @ poses[k]
+            if also == "loops":
+                places = frontend.describe(frames[0]), frontend.describe(current)
+                assert isinstance(frontend.recognize(*places, current), RelativePose)
+            elif also:
+                with monkeypatch.context() as patch:
+                    if also == "refused":
+                        patch.setattr(klt, "check_view", refuse)
+                        patch.setattr(frontend, "_check_depth", lambda *each: refuse(each[-1]))
+                    found = frontend.register(frames[0], current, MotionPrior(T_predicted=T))
+                assert isinstance(found, Failure) == (also == "refused")
+            frontend.rig_offsets.advance()
+        return [frontend.rig_offsets.readout.value, frontend.rig_offsets.disparity.value]
+
+    assert learnt("loops") == learnt("refused") == learnt("") != learnt("links")
+
+
 def test_nothing_is_learnt_where_it_is_switched_off() -> None:
     offsets = RigOffsets(config(12.5, estimate_offset=False))
-    offsets.note(result(disparity_px=0.1, readout_s=0.01), 10)
     offsets.note_rows(0.2, 10)
     offsets.advance()
-    assert not offsets.is_learning
+    assert not offsets.learnt
     assert offsets.as_json() == {
         "disparity_px": 0.0,
         "disparity_sigma_px": 0.1,
