@@ -270,7 +270,7 @@ class FrameVelocities:
         """Return what the rows of the newest frame told of its velocity, if they did."""
         return self._measured.get(observations) if observations in self._sigmas else None
 
-    def error(self, observations: Stamped) -> FloatArray | None:
+    def error(self, observations: Stamped) -> FloatArray:
         """Return by how much the pose of a frame was off when it was the newest, a twist (6,).
 
         Its velocity is known better since the next step. The pose that its own step led to is the
@@ -278,7 +278,7 @@ class FrameVelocities:
         """
         measured, velocity = self._measured.get(observations), self.of(observations)
         if measured is None or velocity is None:
-            return None
+            return np.zeros(6)
         # The pose is the inverse of the step: what is left of one is right of the other.
         return -measured.found.effects @ ((velocity - measured.velocity) / measured.sigmas)
 
@@ -342,7 +342,6 @@ class RigOffsets:
         self._disparity_error: ConstantError | None = None
         self._readout_errors: list[ConstantError] = []
         self._row_px: float | None = None
-        self._last_row_ns: int | None = None
 
     @property
     def disparity_px(self) -> float:
@@ -386,19 +385,9 @@ class RigOffsets:
         # Matches that a wrong readout time contradicts are outliers, the others confirm it.
         self._readout_errors.append(error.widened((result.n_matches / result.n_inliers) ** 2))
 
-    def note_rows(self, row_px: float | None, stamp_ns: int) -> None:
-        """Take the row offset of a frame; each frame counts once.
-
-        Parameters
-        ----------
-        row_px : float or None
-            Row in the right image minus row in the left.
-        stamp_ns : int
-            Of that frame.
-        """
-        is_new = self._last_row_ns is None or stamp_ns > self._last_row_ns
-        if DISPARITY in self.learnt and is_new and row_px is not None:
-            self._last_row_ns = stamp_ns
+    def note_rows(self, row_px: float | None) -> None:
+        """Take what a step's reference tells: row in the right image minus row in the left."""
+        if DISPARITY in self.learnt:
             self._row_px = row_px
 
     def advance(self) -> None:
@@ -425,17 +414,14 @@ class RigOffsets:
 
     def as_json(self) -> dict[str, float]:
         """Return values and sigmas as plain numbers; a sigma of 0: it was given."""
-        readout = {
-            "readout_ms": round(1e3 * self.readout.value, 2),
-            "readout_sigma_ms": round(1e3 * self.readout.sigma, 2),
-        }
-        if not self._is_stereo:
-            return readout
-        return {
+        offsets = {
             "disparity_px": round(self.disparity.value, 4),
             "disparity_sigma_px": round(self.disparity.sigma, 4),
             "row_px": round(self.row.value, 4),
-            **readout,
+        }
+        return (offsets if self._is_stereo else {}) | {
+            "readout_ms": round(1e3 * self.readout.value, 2),
+            "readout_sigma_ms": round(1e3 * self.readout.sigma, 2),
         }
 
 
@@ -666,8 +652,7 @@ class CalibratedCamera:
         result = register_correspondences(prepared, measured.matches, self._camera, config, **hints)
         if isinstance(result, Failure):
             return result
-        error = self._offsets.velocities.error(measured.frames[0])
-        T_correction = np.eye(4) if error is None else se3.exp(error)
+        T_correction = se3.exp(self._offsets.velocities.error(measured.frames[0]))
         # In sigmas of what is known of each constant, as the sensitivities are.
         constants = result.calibration_errors
         effects = {name: np.zeros(6) for name in (DISPARITY, READOUT, *_VELOCITIES)}

@@ -169,7 +169,8 @@ class KltFrontend:
         if isinstance(result, RelativePose):
             is_step = prior is None or prior.T_recent is not None
             self._calibrated.accept(result, self._config, is_step=is_step)
-            self.rig_offsets.note_rows(reference.corners.row_px, reference.stamp_ns)
+            if is_step:
+                self.rig_offsets.note_rows(reference.corners.row_px)
         return result
 
     def _register(
@@ -649,14 +650,9 @@ class KltObservations:
         return self.corners.keypoints
 
     @property
-    def disparities(self) -> FloatArray:
-        """Disparities of the corners as measured, shape (n,)."""
-        return self.corners.disparities
-
-    @property
     def uvd(self) -> FloatArray:
         """Pixels and disparities of the corners as measured, shape (n, 3)."""
-        return np.column_stack([self.keypoints, self.disparities])
+        return np.column_stack([self.keypoints, self.corners.disparities])
 
     @property
     def points_cam(self) -> FloatArray:

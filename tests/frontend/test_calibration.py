@@ -136,16 +136,14 @@ def test_one_misfit_far_off_does_not_undo_what_many_showed() -> None:
 def test_what_is_noted_counts_from_the_next_frame_and_once() -> None:
     offsets = RigOffsets(config())
     offsets.note_disparity(result(disparity_px=0.1).calibration_errors["disparity_px"])
-    offsets.note_rows(0.2, 10)
-    offsets.note_rows(-5.0, 10)
-    offsets.note_rows(None, 11)
+    offsets.note_rows(0.2)
     assert offsets.disparity.value == offsets.row.value == 0.0
     offsets.advance()
     disparity_px, row_px = offsets.disparity.value, offsets.row.value
     assert 0.0 < disparity_px <= 0.1
     assert 0.0 < row_px <= 0.2
-    for stamp_ns in range(12, 99):
-        offsets.note_rows(0.2, stamp_ns)  # measured while less of it was known
+    for _ in range(87):
+        offsets.note_rows(0.2)  # measured while less of it was known
         offsets.advance()
         assert row_px <= offsets.row.value <= 0.2
     assert offsets.row.value == pytest.approx(0.2, abs=0.01)
@@ -256,7 +254,7 @@ def test_what_is_refused_and_loops_tell_nothing_of_the_camera(
 
 def test_nothing_is_learnt_where_it_is_switched_off() -> None:
     offsets = RigOffsets(config(12.5, estimate_offset=False))
-    offsets.note_rows(0.2, 10)
+    offsets.note_rows(0.2)
     offsets.advance()
     assert not offsets.learnt
     assert offsets.as_json() == {
@@ -377,9 +375,8 @@ def test_a_pose_is_off_by_what_is_learnt_of_its_velocity_later() -> None:
     assert velocities.measured(third) is measured
     assert_velocity(velocities, third, measured.velocity)
     error = velocities.error(third)
-    assert error is not None
     np.testing.assert_array_equal(error, 0.0)
-    assert velocities.error(second) is None
+    assert not velocities.error(second).any()
     velocities.expect(third, fourth, se3.exp(STEPS[0]))
     mean = 5.0 * (STEPS[1] + STEPS[0])
     assert_velocity(velocities, third, mean)
@@ -388,7 +385,6 @@ def test_a_pose_is_off_by_what_is_learnt_of_its_velocity_later() -> None:
     velocities.copy(third, place)
     for frame in (third, place):
         error = velocities.error(frame)
-        assert error is not None
         change = (mean - measured.velocity) / sigmas
         np.testing.assert_allclose(error, -measured.found.effects @ change)
     # Where the next step fails, what was measured is the best that is known.
@@ -397,7 +393,7 @@ def test_a_pose_is_off_by_what_is_learnt_of_its_velocity_later() -> None:
     # Registered anew it is measured anew.
     velocities.expect(second, third, se3.exp(STEPS[1]))
     assert velocities.measured(third) is None
-    assert velocities.error(third) is None
+    assert not velocities.error(third).any()
 
 
 def test_rows_tell_the_velocity_of_the_newest_frame() -> None:
