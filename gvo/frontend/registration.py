@@ -100,9 +100,9 @@ def register_correspondences(
     note("registration.begin", **given)
     if prior is not None and T_start is None:
         T_start = se3.invert(prior.T_predicted)
-    consensus = _find_consensus(T_start, correspondences, camera, config, stamps_ns)
-    is_known = isinstance(consensus, Consensus) and consensus.T_target_source is T_start
-    note("registration.consensus", consensus=consensus, is_known=is_known)
+    known = _known_consensus(T_start, correspondences, camera, config)
+    consensus = known or search_consensus(correspondences, camera, config, stamps_ns)
+    note("registration.consensus", consensus=consensus, is_known=known is not None)
     if isinstance(consensus, Failure):
         return consensus
     refined = _refine(consensus, correspondences, camera, config)
@@ -129,7 +129,8 @@ def estimate_roughly(
     wide = {name: _ROUGH_FACTOR * getattr(config.ransac, name) for name in thresholds}
     config = config.model_copy(update={"ransac": config.ransac.model_copy(update=wide)})
     T = None if prior is None else se3.invert(prior.T_predicted)
-    found = _find_consensus(T, correspondences, camera, config, stamps_ns)
+    known = _known_consensus(T, correspondences, camera, config)
+    found = known or search_consensus(correspondences, camera, config, stamps_ns)
     if isinstance(found, Failure):
         return found
     T, huber = found.T_target_source, config.registration.huber
@@ -138,29 +139,18 @@ def estimate_roughly(
     return T if refined is None else refined
 
 
-def _find_consensus(
-    T_start: FloatArray | None,
-    correspondences: Correspondences,
-    camera: StereoCamera,
-    config: Config,
-    stamps_ns: tuple[int, int],
-) -> Consensus | Failure:
-    """Return the inliers of the start value where they are most of the matches, else search.
-
-    Where RANSAC finds fewer, they stay: three matches tell a motion poorly where images are blurred
-    or rows bent.
-    """
-    if T_start is None or config.registration.refine == "none":
-        return search_consensus(correspondences, camera, config, stamps_ns)
-    inliers = find_inliers(T_start[np.newaxis], correspondences, camera, config.ransac)[0]
+def _known_consensus(
+    T: FloatArray | None, correspondences: Correspondences, camera: StereoCamera, config: Config
+) -> Consensus | None:
+    """Return the inliers of the start value, if they are most of the matches."""
+    if T is None or config.registration.refine == "none":
+        return None
+    inliers = find_inliers(T[np.newaxis], correspondences, camera, config.ransac)[0]
     n_needed = max(config.ransac.min_inliers, _MIN_KNOWN_SHARE * len(correspondences))
     note("registration.known", inliers=inliers, n_needed=n_needed)
-    n, known = np.count_nonzero(inliers), Consensus(T_target_source=T_start, inliers=inliers)
-    if n >= n_needed:
-        return known
-    found = search_consensus(correspondences, camera, config, stamps_ns)
-    n_found = 0 if isinstance(found, Failure) else np.count_nonzero(found.inliers)
-    return known if n >= max(n_found, config.ransac.min_inliers) else found
+    if np.count_nonzero(inliers) < n_needed:
+        return None
+    return Consensus(T_target_source=T, inliers=inliers)
 
 
 def _refine(

@@ -9,14 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gvo._trace import watched
 from gvo.config import Config
 from gvo.frontend import registration
 from gvo.frontend.registration import check_rows, estimate_roughly, register_correspondences
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
-from gvo.geometry.ransac import Consensus
 from gvo.types import Failure, FloatArray, IntArray, MotionPrior, Observations, RelativePose
 from tests.results import observations_of
 
@@ -276,21 +274,6 @@ def test_seven_in_ten_matches_must_confirm_a_prediction(
         return
     with pytest.raises(AssertionError, match="samples"):
         register_matches(reference, current, matches, CAMERA, configure(), start=T)
-
-
-@pytest.mark.parametrize(("n_found", "is_kept"), [(None, True), (75, True), (80, False)])
-def test_samples_have_to_find_more_than_a_prediction_has(
-    monkeypatch: pytest.MonkeyPatch, n_found: int | None, is_kept: bool
-) -> None:
-    T, reference, current, matches = two_frames(5, n_outliers=45, noise=0.0)
-    assert len(matches) - 45 == 75
-    found: Consensus | Failure = Failure(reason="nothing")
-    if n_found is not None:
-        found = Consensus(T_target_source=np.eye(4), inliers=np.arange(len(matches)) < n_found)
-    monkeypatch.setattr(registration, "search_consensus", lambda *_: found)
-    with watched() as trace:
-        register_matches(reference, current, matches, CAMERA, configure(), start=T)
-    assert trace.find("registration.consensus")["is_known"] == is_kept
 
 
 def test_rows_that_are_bent_are_inliers_of_a_rough_estimate_only(

@@ -186,8 +186,8 @@ def _consensus_caption(explanation: FrameExplanation, step: Step) -> str:
         )
     if step.is_known:
         text += (
-            "The refinement starts from these matches and the predicted motion, as samples find no "
-            "more of them. The curve shows what they find: "
+            "So none were drawn: the refinement starts from these matches and the predicted "
+            "motion. The curve shows what the samples would have found: "
         )
     text += _samples_text(step.samples)
     if step.n_inliers is not None and not step.is_known:
@@ -223,7 +223,7 @@ def _draw_samples(axes: Axes, step: Step) -> None:
             axes.axvline(len(counts), color=LIMIT, linestyle="--", label=label)
     axes.axhline(n_matches, color="black", linestyle=":", label=f"all {n_matches} matches")
     axes.set(xlim=(0, max(n_planned, 1) * 1.02), ylim=(0, 1.25 * max(n_matches, 1)))
-    title = "what samples find"
+    title = f"what the samples {'would have ' if step.is_known else ''}found"
     finish_axes(axes, "sample", "inliers", title, loc="upper right", ncols=4)
 
 
