@@ -364,8 +364,10 @@ def convert_(
     parameters: opt.Parameters,
 ) -> None:
     """Write a data-set folder as a bag, or a bag as such a folder."""
+    from gvo.io.convert.common import check_new
     from gvo.io.convert.convert import convert
 
+    check_new(target)
     source = opt.open_source(recordings, parameters, options)
     with (
         interruptible() as check,
