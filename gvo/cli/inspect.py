@@ -1,4 +1,4 @@
-"""The commands that look into a recording: explain, view, round-trip."""
+"""The commands that look into a recording: explain, view."""
 
 from __future__ import annotations
 
@@ -8,17 +8,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
 from typer import Argument, Option
 
 from gvo.cli import options as opt
 from gvo.cli.terminal import (
-    at_work,
-    exit_code,
     interruptible,
     progress,
     say,
-    told_where_it_stands,
     warn,
 )
 from gvo.errors import GvoError
@@ -108,36 +104,3 @@ def _find_truth(source: Source) -> Trajectory | None:
         warn([f"no ground truth: {error}"])
         return None
     return None if isinstance(truth, Failure) else truth.trajectory
-
-
-def round_trip(
-    recordings: opt.Recordings,
-    *,
-    out: opt.Out = None,
-    force: opt.Force = False,
-    excerpt: opt.Excerpt,
-    parameters: opt.Parameters,
-    options: opt.Options,
-) -> None:
-    """Run forward, then backward: the drift without a ground truth."""
-    from gvo.runs.round_trip import run_round_trip
-    from gvo.trajectory.round_trip import format_round_trip_errors
-
-    out = opt.new_folder(out, recordings[0], what="-round-trip", force=force)
-    source = opt.open_source(recordings, parameters, options)
-    for line in source.info.decisions:
-        say(line)
-    with at_work(told_where_it_stands(out), progress(source.info.name)) as work:
-        result = run_round_trip(
-            source,
-            out,
-            config=parameters,
-            excerpt=excerpt,
-            force=force,
-            on_progress=work.on_progress,
-            on_written=work.on_written,
-        )
-    say(format_round_trip_errors(result.errors), nl=False)
-    say(out / "round_trip.png")
-    warn(result.warnings)
-    raise typer.Exit(exit_code(result.is_complete))

@@ -18,7 +18,7 @@ from gvo._text import plain_floats
 from gvo._version import __version__
 from gvo.cli import options as opt
 from gvo.cli.batch import batch
-from gvo.cli.inspect import explain, round_trip, view
+from gvo.cli.inspect import explain, view
 from gvo.cli.live import live
 from gvo.cli.terminal import (
     EXIT_FAULTS,
@@ -415,7 +415,7 @@ def _parse_lengths(text: str) -> list[float]:
     return lengths
 
 
-for _each in (batch, live, explain, view, round_trip):
+for _each in (batch, live, explain, view):
     _command()(_each)
 
 

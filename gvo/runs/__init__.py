@@ -1,1 +1,1 @@
-"""One recording, one folder: a run, smoothing of other front-ends' edges, a round trip."""
+"""One recording, one folder: a run, or the smoothing of other front-ends' edges."""

@@ -13,11 +13,10 @@ import numpy as np
 from gvo._text import visible
 from gvo.errors import ConfigurationError, TrajectoryError, write_faults
 from gvo.trajectory.alignment import AlignMode
-from gvo.trajectory.round_trip import RoundTripError
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
 from gvo.viz.measures import compare
-from gvo.viz.palette import ESTIMATES, OTHERS, REFERENCE_STYLE, Style, styles_of
+from gvo.viz.palette import REFERENCE_STYLE, Style, styles_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,7 +36,6 @@ _FLAT = 0.05  # extent of a flat axis, relative to another
 _DOWN = 0.8  # cosine, on the mean, of the camera's y axis and that of a world whose y points down
 _GAP = 10.0  # a line is broken at steps longer than so many medians
 _SIZE_INCHES = (11.0, 5.5)
-_ROUND_TRIP_INCHES = (11.0, 6.2)
 _LEGEND_CHARACTERS = 135  # of a row
 _MAX_POINTS = 4000
 
@@ -150,112 +148,6 @@ def _around(reference: Trajectory, first_ns: int, last_ns: int) -> Trajectory:
     start = int(np.searchsorted(reference.stamps_ns, first_ns, side="right")) - 1
     end = int(np.searchsorted(reference.stamps_ns, last_ns))
     return reference.select(slice(max(start, 0), end + 1))
-
-
-def plot_round_trip(path: str | Path, errors: Mapping[str, RoundTripError]) -> None:
-    """Draw a round trip from above, forward solid and backward dashed, and its errors per frame.
-
-    The world is that of the first camera: x right, z forward. Equal input gives equal files.
-
-    Parameters
-    ----------
-    path : str or Path
-        With suffix .png, .pdf or .svg.
-    errors : mapping of str to RoundTripError
-        By name of the trajectory, at least one; "raw", "causal" and "smoothed" have fixed colours.
-
-    Raises
-    ------
-    TrajectoryError
-        When the file cannot be written.
-    ValueError
-        When there is no trajectory.
-    """
-    if not errors:
-        raise ValueError("expected at least one trajectory")
-    save_figure(_draw_round_trip(errors), Path(path))
-
-
-def _draw_round_trip(errors: Mapping[str, RoundTripError]) -> Figure:
-    figure = _new_figure(_ROUND_TRIP_INCHES)
-    axes = figure.subplot_mosaic(
-        [["view", "end", "metres"], ["view", "end", "degrees"]], width_ratios=[1.15, 1.0, 1.15]
-    )
-    for name, error in errors.items():
-        colour = ESTIMATES.get(name, OTHERS[0])
-        _draw_ways(axes["view"], error, colour)
-        _draw_gap(axes["end"], error, colour, name)
-        _draw_errors(axes["metres"], error, error.errors_m, colour)
-        _draw_errors(axes["degrees"], error, error.errors_deg, colour)
-    _finish_round_trip_view(axes["view"], next(iter(errors.values())))
-    _finish_end(axes["end"], errors)
-    _finish_errors(axes["metres"], axes["degrees"])
-    handles, labels = axes["end"].get_legend_handles_labels()
-    add_legend(figure, handles, labels, math.ceil(len(labels) / 2), loc="outside lower center")
-    return figure
-
-
-def _draw_ways(view: Axes, error: RoundTripError, colour: str) -> None:
-    for trajectory, linestyle in ((error.forward, "-"), (error.backward, "--")):
-        shown = trajectory.positions[evenly(len(trajectory), _MAX_POINTS)]
-        view.plot(shown[:, 0], shown[:, 2], color=colour, linestyle=linestyle, linewidth=1.2)
-
-
-def _draw_gap(end: Axes, error: RoundTripError, colour: str, name: str) -> None:
-    """Draw the last position of the way back relative to the start, joined by a line."""
-    gap = error.errors[0, :3, 3]
-    share = "" if error.error_pct is None else f", {error.error_pct:.3g} % of the path"
-    label = f"{name}: {error.error_m:.3g} m{share}, {error.error_deg:.3g} deg"
-    end.plot([0.0, gap[0]], [0.0, gap[2]], color=colour, linewidth=1.2)
-    # causal and smoothed end in the same pose: the larger hollow mark shows around the other
-    size, face = (13.0, "none") if name == "causal" else (7.0, colour)
-    end.plot(gap[0], gap[2], "s", mec=colour, mfc=face, mew=1.5, markersize=size, label=label)
-
-
-def _draw_errors(panel: Axes, error: RoundTripError, values: FloatArray, colour: str) -> None:
-    stamps_ns = error.forward.stamps_ns
-    rows = evenly(len(stamps_ns), _MAX_POINTS)
-    to_turn_s = (stamps_ns[rows] - stamps_ns[-1]) / 1e9
-    panel.plot(to_turn_s, values[rows], color=colour, linewidth=1.2)
-
-
-def _finish_round_trip_view(view: Axes, error: RoundTripError) -> None:
-    from matplotlib.lines import Line2D
-
-    view.plot(0.0, 0.0, "o", **HOLLOW)
-    view.plot(*error.forward.positions[-1, [0, 2]], "^", **HOLLOW)
-    _set_view(view, (0, 2))
-    view.set_title("from above")
-    view.margins(0.08)
-    grey = "#555555"
-    hollow: dict[str, Any] = {"color": "none", "mfc": "white", "mec": "black"}
-    keys = [
-        Line2D([], [], color=grey, linestyle="-", label="forward"),
-        Line2D([], [], color=grey, linestyle="--", label="backward"),
-        Line2D([], [], marker="o", label="start", **hollow),
-        Line2D([], [], marker="^", label="turn", **hollow),
-    ]
-    view.legend(handles=keys, loc="best", fontsize="small")
-
-
-def _finish_end(end: Axes, errors: Mapping[str, RoundTripError]) -> None:
-    end.plot(0.0, 0.0, "o", **HOLLOW)
-    largest = max(float(np.abs(error.errors[0, [0, 2], 3]).max()) for error in errors.values())
-    limit = 1.25 * max(largest, 1e-6)
-    end.set(xlim=(-limit, limit), ylim=(-limit, limit))
-    end.set(xlabel="x [m]", ylabel="z [m]", title="round-trip error, from above")
-    end.set_aspect("equal", adjustable="box")
-    end.locator_params(nbins=5)
-    end.grid(alpha=0.3)
-
-
-def _finish_errors(metres: Axes, degrees: Axes) -> None:
-    metres.set(ylabel="distance [m]", title="between forward and backward")
-    degrees.set(ylabel="angle [deg]", xlabel="frame, before the turn [s]")
-    metres.tick_params(labelbottom=False)
-    for panel in (metres, degrees):
-        panel.set_ylim(bottom=0.0)
-        panel.grid(alpha=0.3)
 
 
 def evenly(n: int, n_most: int) -> IntArray:

@@ -15,7 +15,6 @@ COMMANDS = (
     ("convert", "{}", "c.mcap"),
     ("convert", "{}", "folder", "--layout", "tum"),
     ("explain", "{}", "--frame", "0"),
-    ("round-trip", "{}", "--duration", "0.5"),
     ("smooth", "{}"),
     ("compare", "{}", "{}"),
     ("compare", "{}#tf:a:b", "{}"),

@@ -231,7 +231,6 @@ def test_commands_write_only_what_they_are_told_to(small_bag: Path, watched: Wat
             ["convert", bag, f"{out}/drive.db3"],
             ["convert", bag, f"{out}/kitti", "--layout", "kitti"],
             ["explain", bag, "--frame", "3", "--out", f"{out}/explained"],
-            ["round-trip", bag, "--out", f"{out}/round-trip"],
         ]
     )
     watched.assert_nothing_elsewhere(deeds)

@@ -20,7 +20,6 @@ import pytest
 import gvo
 from tests.conftest import (
     GVO,
-    TABLES,
     Command,
     assert_same_files,
     interrupt,
@@ -32,7 +31,7 @@ from tests.viz.explanation.test_explanation import RGBD, STEREO
 
 COMMANDS = (
     *("demo", "run", "check", "smooth", "compare", "convert", "config"),
-    *("batch", "live", "explain", "view", "round-trip"),
+    *("batch", "live", "explain", "view"),
 )
 FILE_STARTS = {".png": b"\x89PNG\r\n\x1a\n", ".pdf": b"%PDF-", ".rrd": b"RRF"}
 # Of rendered recordings.
@@ -268,41 +267,6 @@ def test_a_frame_is_explained_by_depth(command: Command, room_bag: Path, tmp_pat
     assert numbers["stereo"] is None
 
 
-# gvo round-trip
-
-
-def test_a_round_trip_is_measured_by_the_poses_that_it_writes(
-    command: Command, room_bag: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
-    answer = command("round-trip", room_bag, "--out", out, "--duration", "0.19")
-    assert (answer.code, answer.err) == (0, "")
-    assert starts_rightly(out / "round_trip.png")
-    assert set(TABLES) < names_of(out)
-    told = json.loads((out / "summary.json").read_text())["round_trip"]["estimates"]
-    for name in ("raw", "causal", "smoothed"):
-        rows = np.loadtxt(out / f"{name}.txt")
-        assert len(rows) == 2 * 6 - 1
-        error_m = np.linalg.norm(rows[-1, 1:4] - rows[0, 1:4])
-        assert told[name]["error_m"] == pytest.approx(error_m, rel=1e-3, abs=1e-8)
-        assert np.isfinite([told[name][key] for key in ("error_pct", "error_deg")]).all()
-        assert f"{error_m:.4f}" in answer.out
-
-
-def test_a_recording_that_breaks_off_is_driven_back_from_there(
-    command: Command, room_bag: Path, tmp_path: Path
-) -> None:
-    cut = tmp_path / "cut.bag"
-    cut.write_bytes(room_bag.read_bytes()[: room_bag.stat().st_size // 3])
-    answer = command("round-trip", cut, "--out", tmp_path / "out")
-    assert answer.code == 3
-    assert answer.err.startswith("gvo: warning: ")
-    assert "cut.bag" in answer.err
-    n_rows = count_rows(tmp_path / "out/frames.csv")
-    assert n_rows % 2 == 1
-    assert 2 < n_rows < 2 * 20 - 1
-
-
 # gvo view
 
 
@@ -394,7 +358,6 @@ def test_a_run_is_served_beside_a_taken_port_until_it_is_ended(
         ["explain", "{bag}", "--frame", "one", "--out", "out"],
         ["explain", "{bag}", "--out", "out"],
         ["explain"],
-        ["round-trip"],
         ["view"],
         ["view", "{bag}", "--port", "70000"],
         ["view", "{bag}", "--prot", "0"],
@@ -408,7 +371,7 @@ def test_a_command_line_that_cannot_be_is_refused_as_all_else(
     answer = command(*(argument.format(bag=room_bag) for argument in arguments))
     assert len(refused(answer)) < 300
     assert answer.out == ""
-    assert re.search(r"; see `gvo( view| explain| round-trip)? --help`$", answer.err)
+    assert re.search(r"; see `gvo( view| explain)? --help`$", answer.err)
 
 
 @pytest.mark.parametrize(

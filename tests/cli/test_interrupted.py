@@ -13,7 +13,7 @@ import pytest
 import gvo
 from gvo.frontend.klt import KltFrontend
 from gvo.io.bag.reader import BagMessage
-from gvo.runs import round_trip, smooth
+from gvo.runs import smooth
 from gvo.runs.smooth import Smoother
 from gvo.trajectory import evaluation
 from gvo.viz.report import run as report
@@ -56,7 +56,6 @@ def interrupt(monkeypatch: pytest.MonkeyPatch) -> Interrupt:
         (("check", "{bag}"), ANEW),
         (("convert", "{bag}", "{out}.bag"), f"{{out}}.bag is not written; {ANEW}"),
         (("explain", "{bag}", "--frame", "9", "--out", "{out}"), ANEW),
-        (("round-trip", "{bag}", "--out", "{out}"), POSES_STAND),
         (("run", "{bag}", "--out", "{out}"), POSES_STAND),
     ],
     ids=lambda case: case[0][0],
@@ -119,9 +118,8 @@ def test_a_signal_while_the_report_is_drawn_leaves_the_whole_run(
     [
         (smooth, "plot_trajectories", ("smooth", "{poses}")),
         (smooth, "plot_trajectories", ("smooth", "{poses}", "--window")),
-        (round_trip, "plot_round_trip", ("round-trip", "{bag}", "--duration", "0.3")),
     ],
-    ids=["optimized", "window", "round trip"],
+    ids=["optimized", "window"],
 )
 def test_a_signal_while_a_picture_is_drawn_ends_at_once(
     command: Command, interrupt: Interrupt, drive_bag: Path, tmp_path: Path, case: tuple[Any, ...]

@@ -68,7 +68,6 @@ def texts(folder: Path) -> Iterator[str]:
                 ("check", "{bag}"),
                 ("run", "{bag}", "--no-report", "--bag", "o.mcap", "--rerun", "o.rrd"),
                 ("convert", "{bag}", "o.bag"),
-                ("round-trip", "{bag}", "--duration", "0.3"),
                 ("explain", "{bag}", "--frame", "1"),
                 ("batch", "{bag}", "--duration", "0.3", "--out", "o"),
             )

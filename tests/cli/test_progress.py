@@ -97,15 +97,6 @@ def test_the_tracked_share_is_that_of_the_run(room_bag: Path, tmp_path: Path) ->
     assert int(shown.states()[-1]["tracked"]) == pytest.approx(100 * share, abs=0.51)
 
 
-@pytest.mark.acceptance
-def test_a_round_trip_counts_the_way_there_and_the_way_back(room_bag: Path, tmp_path: Path) -> None:
-    shown = on_terminal("round-trip", room_bag, "--out", tmp_path, columns=100)
-    assert shown.code == 0
-    check_order(shown)
-    n_frames = (tmp_path / "frames.csv").read_text().count("\n") - 1
-    assert int(shown.states()[-1]["done"]) == n_frames == 2 * 20 - 1
-
-
 def test_a_pipe_gets_no_bar(room_bag: Path, tmp_path: Path) -> None:
     options = ["--out", tmp_path, "--duration", "0.2", "--no-report"]
     done = python(*GVO[1:], "run", room_bag, *options)

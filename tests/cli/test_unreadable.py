@@ -25,7 +25,6 @@ RECORDING_COMMANDS = (
     ("check", "{}"),
     ("convert", "{}", "{out}.mcap"),
     ("explain", "{}", "--frame", "0", "--out", "{out}"),
-    ("round-trip", "{}", "--out", "{out}"),
     ("view", "{}", "--port", "0"),
 )
 POSE_COMMANDS = (

@@ -17,7 +17,6 @@ from gvo.errors import OutputError, RunBusyError
 from gvo.io.convert.bag_messages import BagWriter
 from gvo.io.edges.opening import open_edges
 from gvo.io.run_folder.reader import read_run
-from gvo.runs.round_trip import run_round_trip
 from gvo.runs.smooth import optimize_edges, smooth_edges, smooth_lines
 from gvo.types import Progress
 from tests.conftest import GVO, TABLES, assert_same_files, line_of_poses, python, run_of
@@ -190,18 +189,6 @@ def test_a_bag_on_a_full_disk_takes_nothing_from_the_run(
     ]
     drive.assert_same(tmp_path / "out")
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
-
-
-def test_a_round_trip_on_a_full_disk_says_how_far_it_came(
-    drive: Reference, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    full = _FullDisk("raw.txt", (drive.killed / "7" / "raw.txt").stat().st_size - 40)
-    monkeypatch.setattr("gvo.io.run_folder.line_file.io.FileIO", full.make)
-    said = rf"raw\.txt.*No space left.*; 7 frames stand whole in {tmp_path}$"
-    with pytest.raises(OutputError, match=said):
-        run_round_trip(gvo.open_recording(drive.bag), tmp_path)
-    assert summary_of(tmp_path)["state"] == "interrupted"
-    assert_whole_lines(tmp_path)
 
 
 def smooth_file(folder: Path, out: Path) -> None:

@@ -33,7 +33,6 @@ SUMMARY = "summary.json"
 LOCK = "run.lock"
 PICTURE = "trajectories.png"
 REPORT = "report.html"
-ROUND_TRIP_PICTURE = "round_trip.png"
 TRUTH = "ground_truth.txt"
 TRUE_POSITIONS = "ground_truth_positions.csv"
 POSITIONS_HEADER = ("stamp_ns", "x_m", "y_m", "z_m")
@@ -58,7 +57,7 @@ _STAGES = ("read", "extract", "register", "links", "window", "loops")
 TIMINGS_HEADER = ("stamp_ns", *(f"{stage}_ms" for stage in _STAGES))
 
 _RESULTS = (
-    *(SUMMARY, "edges.csv", "timings.csv", PICTURE, REPORT, ROUND_TRIP_PICTURE),
+    *(SUMMARY, "edges.csv", "timings.csv", PICTURE, REPORT),
     *(TRUTH, TRUE_POSITIONS, GRAPH, LOOPS, f"{GLOBAL}.txt"),
     "frames.csv",
     *(f"{name}.txt" for name in TRAJECTORIES),
