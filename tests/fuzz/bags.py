@@ -14,9 +14,10 @@ from rosbags.rosbag2 import Writer as Writer2
 
 from gvo.errors import GvoError
 from gvo.io.bag.reader import TF_TYPE, BagReader, find_files, typestore
+from gvo.io.bag.recovery.inflate import DamageError
 from gvo.io.bag.recovery.mcap import McapScan
 from gvo.io.bag.recovery.ros1 import Ros1Scan
-from gvo.io.bag.recovery.scan import DamageError, Scan
+from gvo.io.bag.recovery.scan import Scan
 from gvo.io.bag.source import BagSource
 from gvo.io.bag.topics import COMPRESSED_TYPE
 from gvo.io.poses.tf import read_tf

@@ -31,8 +31,8 @@ from gvo.errors import (
 from gvo.io.bag.image_encodings import decode_rvl
 from gvo.io.bag.messages import decode_compressed, transform_of
 from gvo.io.bag.reader import BagReader, typestore
-from gvo.io.bag.recovery import scan
-from gvo.io.bag.recovery.mcap import MAGIC
+from gvo.io.bag.recovery import inflate
+from gvo.io.bag.recovery.mcap import McapScan
 from gvo.io.calibration.files import read_cameras
 from gvo.io.datasets.files import read_stamped_rows
 from gvo.io.edges.lines import parse_line, read_lines
@@ -369,7 +369,7 @@ def test_what_is_no_file_is_no_image(name: str) -> None:
 
 
 def test_a_chunk_that_explodes_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scan, "MAX_INFLATED", 1 << 20)
+    monkeypatch.setattr(inflate, "MAX_INFLATED", 1 << 20)
     path = tmp_path / "bomb.bag"
     writer = Writer(path)
     writer.set_compression(Writer.CompressionFormat.BZ2)
@@ -419,14 +419,14 @@ def _lying_mcap(content: bytes) -> bytes:
     packed = zstd.compress(topics + content)
     head = struct.pack("<QQQI", 1, 1, len(topics), 0) + text("zstd")
     chunk = record(6, head + struct.pack("<Q", len(packed)) + packed)
-    start = MAGIC + record(1, text("ros2") + text("x"))
+    start = McapScan.magic + record(1, text("ros2") + text("x"))
     index = struct.pack("<QQQQI", 1, 1, len(start), len(chunk), 10) + struct.pack("<HQQ", 1, 0, 0)
     index += text("zstd") + struct.pack("<QQ", len(packed), len(topics))
     counts = struct.pack("<QHIIIIQQI", 1, 1, 1, 0, 0, 1, 1, 1, 10) + struct.pack("<HQ", 1, 1)
     summary = topics + record(0x0B, counts) + record(8, index)
     body = start + chunk + record(0x0F, struct.pack("<I", 0))
     footer = record(2, struct.pack("<QQI", len(body), 0, 0))
-    return body + summary + footer + MAGIC
+    return body + summary + footer + McapScan.magic
 
 
 def test_a_damaged_name_in_a_database_is_no_traceback(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""One bag file, read by rosbags or, where that refuses ROS 1 or MCAP, by walking over its records.
+"""One bag file, read by rosbags; a ROS 1 or MCAP file that rosbags refuses, record by record.
 
 rosbags' readers are used without its `AnyReader`, which parses the definitions of all message
 types: one foreign type that it cannot parse would block the camera's topics.
@@ -9,8 +9,8 @@ from __future__ import annotations
 import os
 import struct
 from array import array
-from collections import Counter
-from collections.abc import Collection, Iterator
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import partial
 from importlib import import_module
@@ -29,28 +29,22 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.serde import SerdeError
 
 from gvo.errors import RecordingError
-from gvo.io.bag.recovery import mcap, ros1
+from gvo.io.bag.recovery.inflate import DamageError, inflate_message, inflate_whole
 from gvo.io.bag.recovery.mcap import McapScan
 from gvo.io.bag.recovery.ros1 import Ros1Scan
-from gvo.io.bag.recovery.scan import (
-    Channel,
-    DamageError,
-    FoundMessage,
-    Scan,
-    inflate_message,
-    inflate_whole,
-    standard_type,
-)
+from gvo.io.bag.recovery.scan import Channel, FoundMessage, Scan, standard_type
 
 _Reader: TypeAlias = Reader1 | Reader2
 _SCANS: dict[str, type[Scan]] = {".bag": Ros1Scan, ".mcap": McapScan}
+_MAGICS = {
+    ".bag": (Ros1Scan.magic, "a ROS 1 bag"),
+    ".mcap": (McapScan.magic, "an MCAP file"),
+    ".db3": (b"SQLite format 3\0", "an SQLite database"),
+}
 
 
 def _storage_faults() -> Iterator[type[Exception]]:
-    """Yield the errors of the libraries that rosbags reads SQLite and Zstandard with.
-
-    It lets them through. The libraries are its own affair, another release may bring others.
-    """
+    """Yield the errors of the libraries that rosbags may read SQLite and Zstandard with."""
     for module, name in (
         ("apsw", "Error"),
         ("compression.zstd", "ZstdError"),
@@ -82,6 +76,15 @@ class BagFile:
     ----------
     path : Path
 
+    Attributes
+    ----------
+    counts : dict of Channel to int
+        The number of messages that are announced.
+    start_time_ns, end_time_ns : int
+        Of the first and last message, by the time of recording.
+    note : str
+        What was decided, in one line; empty if nothing.
+
     Raises
     ------
     RecordingError
@@ -91,14 +94,14 @@ class BagFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.note = ""
-        self._recovered: Scan | None = None
+        self._scan: Scan | None = None
         self._fault = _unread_log(path)
         try:
             with self._opened() as reader:
                 self.counts = _counts(reader)
                 self.start_time_ns, self.end_time_ns = reader.start_time, reader.end_time
         except DAMAGE as error:
-            self._recovered = scan = _recover(path, error)
+            self._scan = scan = _scan(path, error)
             self.counts = scan.counts
             self.start_time_ns, self.end_time_ns = scan.start_time_ns, scan.end_time_ns
             if not scan.damage:
@@ -107,46 +110,54 @@ class BagFile:
     @property
     def damage(self) -> str:
         """What cannot be read, in one line; complete when all messages were read."""
-        lost = "" if self._recovered is None else self._recovered.damage
+        lost = "" if self._scan is None else self._scan.damage
         return "; ".join(text for text in (self._fault, lost) if text)
 
     def messages(self, names: Collection[str]) -> Iterator[FoundMessage]:
         """Yield the messages of some topics, nearly in the order of recording.
 
-        Where rosbags cannot go on, the rest of a ROS 1 or MCAP file is found by walking over its
-        records; of a database it is lost, and `damage` says so.
+        Where rosbags cannot go on, the rest of a ROS 1 or MCAP file is read record by record; of
+        a database it is lost, and `damage` says so.
         """
-        seen = _Seen()
+        # Of the messages of one topic and time only their number matters: they come in one order.
+        seen: dict[Channel, array[int]] = defaultdict(partial(array, "Q"))
         try:
-            if self._recovered is None:
+            if self._scan is None:
                 for message in self._indexed(names):
-                    seen.add(message)
+                    seen[message.channel].append(message.log_time_ns % 2**64)
                     yield message
-                self._check_number(seen.n_messages, names)
+                self._check_number(sum(map(len, seen.values())), names)
                 return
         except DAMAGE as error:
-            self._recovered = self._recover_rest(error)
+            try:
+                self._scan = _scan(self.path, error)
+            except RecordingError as refusal:
+                self._fault = str(refusal)
+                return
         try:
-            for message in self._recovered.messages(names) if self._recovered else ():
-                if message.channel not in self.counts:
-                    self._fault = f"{self.path}: messages of a damaged topic are left out"
-                elif not seen.takes(message):
-                    yield message
+            yield from self._unseen(self._scan.messages(names), seen)
         except DAMAGE as error:  # as of a file that is shortened meanwhile
             self._fault = f"{self.path}: cannot be read on ({_one_line(error)})"
 
+    def _unseen(
+        self, messages: Iterable[FoundMessage], seen: Mapping[Channel, Iterable[int]]
+    ) -> Iterator[FoundMessage]:
+        counts = {channel: Counter(log_times) for channel, log_times in seen.items()}
+        for message in messages:
+            if message.channel not in self.counts:
+                self._fault = f"{self.path}: messages of a damaged topic are left out"
+                continue
+            log_time = message.log_time_ns % 2**64
+            if counts.get(message.channel, Counter())[log_time] > 0:
+                counts[message.channel][log_time] -= 1
+            else:
+                yield message
+
     def _check_number(self, n_messages: int, names: Collection[str]) -> None:
-        """Look after rosbags, which steps over some damage without a word."""
+        """Check what rosbags read: it skips some damage silently."""
         n_announced = sum(n for channel, n in self.counts.items() if channel.name in names)
         if n_messages < n_announced:
             raise DamageError(f"{n_messages} of {n_announced} messages were found")
-
-    def _recover_rest(self, error: Exception) -> Scan | None:
-        try:
-            return _recover(self.path, error)
-        except RecordingError as refusal:
-            self._fault = str(refusal)
-            return None
 
     def _indexed(self, names: Collection[str]) -> Iterator[FoundMessage]:
         with self._opened() as reader:
@@ -174,34 +185,6 @@ class BagFile:
         return reader
 
 
-class _Seen:
-    """Tells the messages that came from the index from those that follow.
-
-    Of the messages of one topic and time only their number matters: they come in one order.
-    """
-
-    def __init__(self) -> None:
-        self._log_times: dict[Channel, array[int]] = {}
-        self._counts: dict[Channel, Counter[int]] = {}
-
-    def add(self, message: FoundMessage) -> None:
-        log_times = self._log_times.setdefault(message.channel, array("Q"))
-        log_times.append(message.log_time_ns % 2**64)
-
-    @property
-    def n_messages(self) -> int:
-        """The number of messages that came."""
-        return sum(map(len, self._log_times.values()))
-
-    def takes(self, message: FoundMessage) -> bool:
-        """Tell whether a message came already, once for each time that it did."""
-        channel, log_time = message.channel, message.log_time_ns % 2**64
-        if channel not in self._counts:
-            self._counts[channel] = Counter(self._log_times.get(channel, ()))
-        self._counts[channel][log_time] -= 1
-        return self._counts[channel][log_time] >= 0
-
-
 def _counts(reader: _Reader) -> dict[Channel, int]:
     counts: Counter[Channel] = Counter()
     for connection in reader.connections:
@@ -214,14 +197,8 @@ def _channel(connection: Connection, reader: _Reader) -> Channel:
     return Channel(connection.topic, standard_type(connection.msgtype), is_ros1)
 
 
-def _recover(path: Path, error: Exception) -> Scan:
-    """Read a file without its index.
-
-    Raises
-    ------
-    RecordingError
-        When no message is found, and for a database.
-    """
+def _scan(path: Path, error: Exception) -> Scan:
+    """Read a file without its index; refuse a database, and where no message is found."""
     refusal = _refusal(path)
     if refusal or "encryption" in str(error):
         raise RecordingError(refusal or f"{path}: cannot be read ({_one_line(error)})") from error
@@ -237,25 +214,17 @@ def _recover(path: Path, error: Exception) -> Scan:
 
 
 def _refusal(path: Path) -> str:
-    """Return why a file is no bag at all; nothing where it is one."""
+    """Return why a file is not a bag; empty if it is one."""
     if not path.is_file():
-        return f"{path}: is no file"
-    if path.stat().st_size == 0:
-        return f"{path}: the file is empty"
-    if path.suffix == ".bag" and not _has_magic(path, ros1.MAGIC):
-        if _has_magic(path, b"#ROS"):
-            return f"{path}: the bag is of an older format than 2.0; run `rosbag fix` on a copy"
-        return f"{path}: is no ROS 1 bag"
-    if path.suffix == ".mcap" and not _has_magic(path, mcap.MAGIC):
-        return f"{path}: is no MCAP file"
-    if path.suffix == ".db3" and not _has_magic(path, b"SQLite format 3\0"):
-        return f"{path}: is no SQLite database"
-    return ""
-
-
-def _has_magic(path: Path, magic: bytes) -> bool:
+        return f"{path}: not a file"
     with path.open("rb") as file:
-        return file.read(len(magic)) == magic
+        start = file.read(16)
+    if not start:
+        return f"{path}: the file is empty"
+    if path.suffix == ".bag" and start.startswith(b"#ROS") and not start.startswith(Ros1Scan.magic):
+        return f"{path}: the bag is of an older format than 2.0; run `rosbag fix` on a copy"
+    magic, kind = _MAGICS.get(path.suffix, (b"", ""))
+    return "" if start.startswith(magic) else f"{path}: not {kind}"
 
 
 def _advise(path: Path, error: Exception) -> str:
@@ -272,15 +241,14 @@ def _one_line(error: Exception) -> str:
 
 
 def _describe_missing_index(path: Path, error: Exception, tool: str) -> str:
-    reason = str(error).strip(" .") or "it is damaged"
     return (
-        f"bag: {path.name} is read without its index ({' '.join(reason.split())}); "
+        f"bag: {path.name} is read without its index ({_one_line(error).strip(' .')}); "
         f"`{tool}` on a copy writes one"
     )
 
 
 def _unread_log(path: Path) -> str:
-    """Return what is to be said where a recorder did not come to write all into a database."""
+    """Say that a recorder left messages in the log of a database; empty if it did not."""
     log = path.with_name(f"{path.name}-wal")
     if path.suffix != ".db3" or not log.is_file() or not log.stat().st_size:
         return ""
@@ -291,11 +259,9 @@ def _unread_log(path: Path) -> str:
 
 
 def _announced_size(path: Path) -> int:
-    """Return the bytes that the header of an SQLite database claims; 0 if it claims none.
+    """Return the size that the header of an SQLite database claims; 0 if it claims none.
 
-    References
-    ----------
-    .. [1] Database File Format, section 1.3, https://sqlite.org/fileformat.html.
+    See https://sqlite.org/fileformat.html, section 1.3.
     """
     with path.open("rb") as file:
         header = file.read(100)

@@ -19,7 +19,8 @@ from rosbags.typesys.store import Typestore
 from gvo._text import YamlError, load_yaml, read_text
 from gvo.errors import RecordingError, named_faults
 from gvo.io.bag.file import FAULTS, BagFile
-from gvo.io.bag.recovery.scan import FoundMessage, inflate_file
+from gvo.io.bag.recovery.inflate import inflate_file
+from gvo.io.bag.recovery.scan import FoundMessage
 from gvo.io.bag.topics import Topic
 
 STORAGE_SUFFIXES = (".mcap", ".db3")

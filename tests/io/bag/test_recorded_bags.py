@@ -72,7 +72,7 @@ _DATABASES = ("good/ros2_all_types_sqlite3", "good/tf_example_ros2")
 _REFUSED = {
     "bad/damaged.bag": "rosbag reindex",
     "bad/empty-file.bag": "the file is empty",
-    "bad/not_a_bag.mcap": "is no MCAP file",
+    "bad/not_a_bag.mcap": "not an MCAP file",
     "bad/version1.bag": "rosbag fix",
 }
 

@@ -1,4 +1,7 @@
-"""Read MCAP files without their summary.
+"""MCAP files without their summary, by the `mcap` package.
+
+Its `StreamReader` stops at the first damage and drops a truncated chunk, and its chunks inflate
+without bound: only its records are used.
 
 References
 ----------
@@ -7,41 +10,37 @@ References
 
 from __future__ import annotations
 
+import struct
 from bisect import bisect_left
-from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
-from typing import TypeAlias
-from zlib import crc32
+from typing import Any
 
-from gvo.io.bag.recovery.scan import (
-    Channel,
-    DamageError,
-    Entry,
-    Losses,
-    Scan,
-    Window,
-    standard_type,
-)
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel as ChannelRecord
+from mcap.records import Chunk, ChunkIndex, Footer, McapRecord, Message, Schema
 
-MAGIC = b"\x89MCAP0\r\n"
+from gvo.io.bag.recovery.inflate import MAX_INFLATED, DamageError
+from gvo.io.bag.recovery.scan import Channel, Losses, Record, Scan, Window, standard_type
 
-_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _, _CHUNK_INDEX = range(1, 9)
-_DATA_END = 0x0F
-_RESERVED = 0x10  # the first one that means nothing yet
-_PRIVATE = 0x80
-_N_FOOTER = 37  # bytes, with the magic at the end
-
-_RecordHead: TypeAlias = tuple[int, int]  # kind, size
+_MAGIC = b"\x89MCAP0\r\n"
+_KINDS: dict[int, Any] = {
+    Opcode.FOOTER: Footer,
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: ChannelRecord,
+    Opcode.MESSAGE: Message,
+    Opcode.CHUNK_INDEX: ChunkIndex,
+}
+_RESERVED = range(0x10, 0x80)  # mean nothing yet
+_N_FOOTER = 9 + 20 + len(_MAGIC)  # bytes, with the magic at the end
 
 
 class McapScan(Scan):
-    """The messages of an MCAP file, read record by record.
+    """The messages of an MCAP file, read record by record."""
 
-    Parameters
-    ----------
-    path : Path
-    """
-
+    magic = _MAGIC
     tool = "mcap recover"
 
     def __init__(self, path: Path) -> None:
@@ -50,132 +49,121 @@ class McapScan(Scan):
         self._places: list[int] | None = None
         super().__init__(path)
 
-    def _step(self, window: Window, losses: Losses) -> list[Entry]:
-        if window.position == 0:
-            window.skip(len(MAGIC))
-        entries: list[Entry] = []
+    def _step(self, window: Window, losses: Losses) -> list[Record]:
         start = window.position
-        op, size = _read_record(window)
-        if op == _CHUNK:
-            entries = self._read_any_chunk(window, size, losses)
-        elif op == _FOOTER:
+        op, size = _read_head(window)
+        if op == Opcode.CHUNK:
+            return self._read_any_chunk(window, size, losses)
+        if op == Opcode.DATA_END:
+            self._data_end = start
+        records = self._take(_read_content(window, op, size))
+        if op == Opcode.FOOTER:
             window.position = window.end
-        else:
-            self._read(op, window.part(size), entries)
-            if op == _DATA_END:
-                self._data_end = start
-        return entries
+        return records
 
-    def _read_any_chunk(self, window: Window, size: int, losses: Losses) -> list[Entry]:
-        start, end = window.position, min(window.position + size, window.end)
-        is_whole = start + size == end
-        record = Window(window.file, start, end)
+    def _read_record(self, window: Window) -> list[Record]:
+        op, size = _read_head(window)
+        if op == Opcode.CHUNK:
+            raise DamageError("a chunk in a chunk")
+        return self._take(_read_content(window, op, size))
+
+    def _take(self, record: McapRecord | None) -> list[Record]:
+        if isinstance(record, Message):
+            return [Record(record.log_time, record.channel_id, record.data)]
+        if isinstance(record, Schema):
+            self._types[record.id] = standard_type(record.name)
+        elif isinstance(record, ChannelRecord):
+            type_ = self._types.get(record.schema_id, "")
+            channel = Channel(record.topic, type_, is_ros1=record.message_encoding == "ros1")
+            self._channels.setdefault(record.id, channel)
+        return []
+
+    def _read_any_chunk(self, window: Window, size: int, losses: Losses) -> list[Record]:
+        start = window.position
+        if size > window.rest:
+            return self._read_cut_chunk(window, losses)
+        record = Window(window.file, start, start + size)
+        window.skip(size)
         try:
-            entries = self._read_content(record, losses, is_whole=is_whole)
+            chunk, _ = _read_chunk_record(record)
+            return self._read_messages(window, chunk, losses)
         except DamageError as error:
-            if not is_whole:
-                raise
-            window.position = self._find_record(record, start + 1)
+            # If the size is wrong, it holds other chunks.
+            window.position = self._find_next(record, start + 1)
             losses.add(start, window.position - start, str(error))
             return []
-        window.position = end if is_whole else record.position
-        return entries
 
-    def _read_content(self, record: Window, losses: Losses, *, is_whole: bool) -> list[Entry]:
-        """Return the messages of a chunk; leave the window at the end of a truncated one."""
-        record.skip(16)  # the times of its messages
-        limit, crc = record.number(8), record.number(4)
-        compression = _text(record)
-        n_bytes = record.number(8)
-        is_cut = n_bytes > record.rest
-        part = Window(record.file, record.position, record.position + min(n_bytes, record.rest))
-        if compression:
-            entries = self._read_inflated(part, compression, losses, limit=limit, crc=crc)
-        else:
-            if crc and not is_cut:
-                _check(part, crc)
-            entries, reason = self._read_chunk(part)
-            if reason or is_cut:
-                reason = f"a chunk of {n_bytes} bytes is cut" if is_cut else reason
-                # The rest of a truncated chunk is read as records outside a chunk.
-                losses.add(part.position, part.rest if is_whole else 0, reason)
-        record.position = part.position
-        return entries
+    def _read_cut_chunk(self, window: Window, losses: Losses) -> list[Record]:
+        """Read a chunk that is truncated, or whose size is wrong."""
+        start = window.position
+        chunk, n_read = _read_chunk_record(window)
+        window.position = start + n_read
+        if window.rest or chunk.compression:
+            records = self._read_messages(window, chunk, losses)
+            window.position = start + n_read
+            return records
+        # The records of a truncated chunk are read as records outside a chunk.
+        window.position -= len(chunk.data)
+        losses.add(window.position, 0, f"a chunk is cut after {len(chunk.data)} bytes")
+        return []
 
-    def _read_inner(self, window: Window, entries: list[Entry]) -> None:
-        op, size = _read_record(window)
-        self._read(op, window.part(size), entries)
+    def _read_messages(self, window: Window, chunk: Chunk, losses: Losses) -> list[Record]:
+        limit, crc = chunk.uncompressed_size, chunk.uncompressed_crc
+        return self._read_packed(window, chunk.data, chunk.compression, losses, limit, crc)
 
-    def _read(self, op: int, part: Window, entries: list[Entry]) -> None:
-        if op == _MESSAGE:
-            channel_id = part.number(2)
-            part.skip(4)  # its number among those of the channel
-            log_time_ns = part.number(8)
-            part.skip(8)  # when it was published
-            entries.append(Entry(log_time_ns, channel_id, part, part.position, part.rest))
-        elif op == _SCHEMA:
-            schema_id = part.number(2)
-            self._types[schema_id] = standard_type(_text(part))
-        elif op == _CHANNEL:
-            channel_id, schema_id = part.number(2), part.number(2)
-            name, encoding = _text(part), _text(part)
-            channel = Channel(name, self._types.get(schema_id, ""), is_ros1=encoding == "ros1")
-            self._channels.setdefault(channel_id, channel)
-        elif op == _CHUNK:
-            raise DamageError("a chunk in a chunk")
-
-    def _find_record(self, window: Window, start: int) -> int:
+    def _find_next(self, window: Window, start: int) -> int:
         """Return the next place that the summary names, if it exists: records have no mark."""
         if self._places is None:
-            self._places = sorted(_places_of_summary(Window(window.file, 0, self._n_bytes)))
+            self._places = sorted(_places_of_summary(window))
         index = bisect_left(self._places, start)
         return min([*self._places[index : index + 1], window.end])
 
-    def _describe_damage(self) -> str:
-        return self._damage_of(self.losses.describe(self._n_bytes, until=self._data_end))
+    def _describe(self, losses: Losses) -> str:
+        return losses.describe(self._n_bytes, until=self._data_end)
 
 
-def _read_record(window: Window) -> _RecordHead:
-    """Return kind and size of a record; leave the window at its content."""
-    op = window.number(1)
-    size = window.number(8)
-    if not 0 < op < _RESERVED and op < _PRIVATE:
+def _read_head(window: Window) -> tuple[int, int]:
+    op, size = struct.unpack("<BQ", window.take(9))
+    if op == 0 or op in _RESERVED:
         raise DamageError(f"a record of unknown kind {op}")
-    if size > window.rest and op != _CHUNK:
-        raise DamageError(f"a record of {size} bytes is cut after {window.rest}")
     return op, size
 
 
-def _text(window: Window) -> str:
-    return window.take(window.number(4)).decode(errors="replace")
+def _read_content(window: Window, op: int, size: int) -> McapRecord | None:
+    if op not in _KINDS:
+        window.skip(size)
+        return None
+    stream = ReadDataStream(BytesIO(window.take(size)))
+    sizes = (size,) if op == Opcode.MESSAGE else ()
+    record: McapRecord = _parse(_KINDS[op], stream, *sizes)
+    return record
 
 
-def _check(part: Window, crc: int) -> None:
-    found = 0
-    for block in Window(part.file, part.position, part.end).blocks():
-        found = crc32(block, found)
-    if found != crc:
-        raise DamageError("a chunk whose checksum does not fit")
+def _read_chunk_record(window: Window) -> tuple[Chunk, int]:
+    """Return a chunk, and how many bytes of it were read."""
+    stream = ReadDataStream(BytesIO(window.take(min(window.rest, MAX_INFLATED))))
+    return _parse(Chunk, stream), stream.count
 
 
-def _places_of_summary(window: Window) -> Iterator[int]:
-    """Yield the places of the chunks, as the summary says, and of the summary."""
-    if window.rest < _N_FOOTER:
-        return
+def _parse(kind: Any, stream: ReadDataStream, *size: int) -> Any:  # noqa: ANN401
     try:
-        window.skip(window.rest - _N_FOOTER)
-        if _read_record(window) != (_FOOTER, _N_FOOTER - 9 - len(MAGIC)):
-            return
-        start = window.number(8)
-        window.position = start
-        while start:
-            op, size = _read_record(window)
-            if op == _FOOTER:
-                yield start
-                return
-            record = window.part(size)
-            if op == _CHUNK_INDEX:
-                record.skip(16)
-                yield record.number(8)
+        return kind.read(stream, *size)
+    except (McapError, struct.error, ValueError, OverflowError) as error:
+        raise DamageError(f"a record that is no {kind.__name__}") from error
+
+
+def _places_of_summary(whole: Window) -> list[int]:
+    """Return where the chunks are, as the summary says, and where it begins itself."""
+    places: list[int] = []
+    window = Window(whole.file, max(whole.end - _N_FOOTER, 0), whole.end)
+    try:
+        footer = _read_content(window, *_read_head(window))
+        if isinstance(footer, Footer) and footer.summary_start:
+            places.append(footer.summary_start)
+            window.position = footer.summary_start
+            while not isinstance(record := _read_content(window, *_read_head(window)), Footer):
+                if isinstance(record, ChunkIndex):
+                    places.append(record.chunk_start_offset)
     except DamageError:
-        return
+        pass
+    return places

@@ -1,4 +1,4 @@
-"""Read bags of ROS 1 (format 2.0) without their index.
+"""Bags of ROS 1 (format 2.0) without their index.
 
 References
 ----------
@@ -7,31 +7,29 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from gvo.io.bag.recovery.inflate import MAX_INFLATED, DamageError
 from gvo.io.bag.recovery.scan import (
-    MAX_INFLATED,
     Channel,
-    DamageError,
-    Entry,
     Losses,
+    Record,
     Scan,
     Window,
     share,
     standard_type,
 )
 
-MAGIC = b"#ROSBAG V2.0\n"
-
 _MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = range(2, 8)
-_INDEX_OPS = (_INDEX, _CHUNK_INFO)
 _MAX_HEADER = 1 << 16
 _CHUNK_MARK = b"\x04\x00\x00\x00op=\x05"
 _CHUNK_HEADER = 64  # bytes; maximum distance of the mark from the start of a chunk
+_SEARCH_BLOCK = 1 << 20
 
 
-class _Record(NamedTuple):
+class _Head(NamedTuple):
     fields: dict[bytes, bytes]
     size: int
 
@@ -41,22 +39,21 @@ class _Record(NamedTuple):
 
     @property
     def compression(self) -> str:
-        return self.fields.get(b"compression", b"").decode(errors="replace")
+        return self.text(b"compression")
 
     def number(self, name: bytes) -> int:
         if name not in self.fields:
             raise DamageError(f"a record without {name.decode()}")
         return int.from_bytes(self.fields[name], "little")
 
+    def text(self, name: bytes) -> str:
+        return self.fields.get(name, b"").decode(errors="replace")
+
 
 class Ros1Scan(Scan):
-    """The messages of a ROS 1 bag, read record by record.
+    """The messages of a ROS 1 bag, read record by record."""
 
-    Parameters
-    ----------
-    path : Path
-    """
-
+    magic = b"#ROSBAG V2.0\n"
     tool = "rosbag reindex"
 
     def __init__(self, path: Path) -> None:
@@ -65,106 +62,99 @@ class Ros1Scan(Scan):
         self._whole_chunks: dict[int, int] = {}  # start: end
         super().__init__(path)
 
-    def _step(self, window: Window, losses: Losses) -> list[Entry]:
-        if window.position == 0:
-            window.skip(len(MAGIC))
-        entries: list[Entry] = []
+    def _step(self, window: Window, losses: Losses) -> list[Record]:
         start = window.position
-        record = _read_record(window)
-        if record.op == _CHUNK and 0 < record.size <= window.rest:
-            end = window.position + record.size
-            entries = self._read_whole_chunk(window, record, losses)
+        head = _read_head(window)
+        if head.op == _BAG:
+            self._index_position = head.number(b"index_pos")
+            self._n_chunks_announced = head.number(b"chunk_count")
+        elif head.op == _CHUNK and not 0 < head.size <= window.rest:
+            return self._read_open_chunk(window, head, losses)
+        elif head.op == _CHUNK:
+            end = window.position + head.size
+            records = self._read_whole_chunk(window, head, losses)
             self._whole_chunks[start] = end
-        elif record.op == _CHUNK:
-            entries = self._read_open_chunk(window, record, losses)
-        elif record.op == _BAG:
-            self._index_position = record.number(b"index_pos")
-            self._n_chunks_announced = record.number(b"chunk_count")
-            window.skip(record.size)
+            return records
         else:
-            self._read(record, window, entries)
-        return entries
+            return self._read(head, window)
+        window.skip(head.size)
+        return []
 
-    def _read_whole_chunk(self, window: Window, record: _Record, losses: Losses) -> list[Entry]:
-        if record.compression != "none":
-            part = Window(window.file, window.position, window.position + record.size)
-            limit = record.number(b"size")
-            entries = self._read_inflated(part, record.compression, losses, limit=limit)
-            window.position = part.position
-            return entries
-        part = window.part(record.size)
-        entries, reason = self._read_chunk(part)
+    def _read_whole_chunk(self, window: Window, head: _Head, losses: Losses) -> list[Record]:
+        start = window.position
+        if head.size > MAX_INFLATED:
+            raise DamageError(f"a chunk that claims {head.size} bytes")
+        content = window.take(head.size)
+        if head.compression != "none":
+            limit = head.number(b"size")
+            return self._read_packed(window, content, head.compression, losses, limit, 0)
+        records, reason, n_read = self._read_chunk(content)
         if reason:
             # If the size is wrong, it holds other chunks.
-            window.position = self._find_record(part, part.position + 1)
-            losses.add(part.position, window.position - part.position, reason)
-        return entries
+            part = Window(window.file, start, window.position)
+            window.position = self._find_next(part, start + n_read + 1)
+            losses.add(start + n_read, window.position - start - n_read, reason)
+        return records
 
-    def _read_open_chunk(self, window: Window, record: _Record, losses: Losses) -> list[Entry]:
+    def _read_open_chunk(self, window: Window, head: _Head, losses: Losses) -> list[Record]:
         """Read a chunk that was never closed, and has no size, or is truncated."""
-        if record.compression == "none":
-            if record.size:
-                reason = f"a chunk of {record.size} bytes is cut after {window.rest}"
+        if head.compression == "none":
+            if head.size:
+                reason = f"a chunk of {head.size} bytes is cut after {window.rest}"
                 losses.add(window.position, 0, reason)
             return []  # its records are read as records outside a chunk
-        limit = record.number(b"size") or MAX_INFLATED
-        return self._read_inflated(window, record.compression, losses, limit=limit)
+        limit = head.number(b"size") or MAX_INFLATED
+        packed = window.take(min(window.rest, MAX_INFLATED))
+        return self._read_packed(window, packed, head.compression, losses, limit, 0)
 
-    def _read_inner(self, window: Window, entries: list[Entry]) -> None:
-        self._read(_read_record(window), window, entries)
+    def _read_record(self, window: Window) -> list[Record]:
+        return self._read(_read_head(window), window)
 
-    def _read(self, record: _Record, window: Window, entries: list[Entry]) -> None:
-        size = record.size
-        if record.op == _MESSAGE:
-            nanoseconds, seconds = divmod(record.number(b"time"), 2**32)
+    def _read(self, head: _Head, window: Window) -> list[Record]:
+        if head.op == _MESSAGE:
+            nanoseconds, seconds = divmod(head.number(b"time"), 2**32)
             log_time_ns = seconds * 10**9 + nanoseconds
-            channel_id = record.number(b"conn")
-            position = window.position
-            window.skip(size)
-            entries.append(Entry(log_time_ns, channel_id, window, position, size))
-        elif record.op == _CONNECTION:
-            self._connect(record, window)
-        elif record.op in _INDEX_OPS:
+            return [Record(log_time_ns, head.number(b"conn"), window.take(head.size))]
+        if head.op == _CONNECTION:
+            header = _Head(_fields_of(window.take(head.size)), 0)
+            type_ = standard_type(header.text(b"type"))
+            channel = Channel(_clean(head.text(b"topic")), type_, is_ros1=True)
+            self._channels.setdefault(head.number(b"conn"), channel)
+        elif head.op == _INDEX:
             # Other readers use the count; some recorders wrote another size.
-            size = 12 * record.number(b"count") if record.op == _INDEX else size
-            window.skip(size)
+            window.skip(12 * head.number(b"count"))
+        elif head.op == _CHUNK_INFO:
+            window.skip(head.size)
         else:
-            raise DamageError(f"a record of unknown kind {record.op}")
+            raise DamageError(f"a record of unknown kind {head.op}")
+        return []
 
-    def _connect(self, record: _Record, window: Window) -> None:
-        header = _fields_of(window.take(record.size))
-        name = record.fields.get(b"topic", b"").decode(errors="replace")
-        type_ = header.get(b"type", b"").decode(errors="replace")
-        channel = Channel(_clean(name), standard_type(type_), is_ros1=True)
-        self._channels.setdefault(record.number(b"conn"), channel)
-
-    def _find_record(self, window: Window, start: int) -> int:
-        for mark in window.find(_CHUNK_MARK, start):
+    def _find_next(self, window: Window, start: int) -> int:
+        for mark in _find(_CHUNK_MARK, Window(window.file, start, window.end)):
             for position in range(mark - 4, max(mark - _CHUNK_HEADER, start) - 1, -1):
                 if _is_chunk(Window(window.file, position, window.end)):
                     return position
         return window.end
 
-    def _describe_damage(self) -> str:
+    def _describe(self, losses: Losses) -> str:
         n_whole, n_announced = len(self._whole_chunks), self._n_chunks_announced
         if n_whole >= n_announced > 0:  # the rest is the index
-            last = max(self._whole_chunks.values())
-            return self._damage_of(self.losses.describe(self._n_bytes, until=last))
+            return losses.describe(self._n_bytes, until=max(self._whole_chunks.values()))
         n_missing = self._index_position - self._n_bytes
         missing = (
             f"at least {share(n_missing, self._index_position)} are missing at its end: "
             f"{n_whole} of {n_announced} chunks are whole"
         )
-        lost = self.losses.describe(self._n_bytes)
-        return self._damage_of(missing if n_missing > 0 else "", lost)
+        said = (missing if n_missing > 0 else "", losses.describe(self._n_bytes))
+        return "; ".join(text for text in said if text)
 
 
-def _read_record(window: Window) -> _Record:
+def _read_head(window: Window) -> _Head:
     """Return the header of a record; leave the window at its data."""
     size = window.number(4)
     if size > _MAX_HEADER:
         raise DamageError(f"a record with a header of {size} bytes")
-    return _Record(_fields_of(window.take(size)), window.number(4))
+    return _Head(_fields_of(window.take(size)), window.number(4))
 
 
 def _fields_of(data: bytes) -> dict[bytes, bytes]:
@@ -180,10 +170,23 @@ def _fields_of(data: bytes) -> dict[bytes, bytes]:
     return fields
 
 
+def _find(pattern: bytes, window: Window) -> Iterator[int]:
+    """Yield the positions of a pattern."""
+    tail = b""
+    while window.rest:
+        data = tail + window.take(min(_SEARCH_BLOCK, window.rest))
+        base = window.position - len(data)
+        found = data.find(pattern)
+        while found >= 0:
+            yield base + found
+            found = data.find(pattern, found + 1)
+        tail = data[len(data) - len(pattern) + 1 :]
+
+
 def _is_chunk(window: Window) -> bool:
     try:
-        record = _read_record(window)
-        return record.op == _CHUNK and bool(record.compression)
+        head = _read_head(window)
+        return head.op == _CHUNK and bool(head.compression)
     except DamageError:
         return False
 

@@ -390,4 +390,4 @@ def test_a_chunk_that_inflates_without_end_is_stopped(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(good + bytes(record))
     _check_memory(path)
-    assert "more than the 5000 bytes" in McapScan(path).damage
+    assert "more than 5000 bytes" in McapScan(path).damage
