@@ -39,10 +39,36 @@ Value: TypeAlias = bool | int | float | str | None
 Kind = Literal["switch", "choice", "integer", "number"]
 _WIDEST_SLIDER = 1000.0
 _N_STEPS = 200
+# Parameters that there are no more, and the values at which they are fixed.
+_FIXED: Mapping[str, Value] = {
+    "depth.icp": "auto",
+    "depth.virtual_baseline_m": 0.075,
+    "klt.cell_size_px": 40,
+    "klt.disparity_sigma_px": 0.15,
+    "klt.max_return_px": 0.5,
+    "klt.min_distance_px": 10,
+    "klt.min_eigenvalue": 1e-4,
+    "klt.n_levels": 2,
+    "klt.n_wide_levels": 4,
+    "klt.pixel_sigma_px": 0.15,
+    "klt.sigma_factor": 2.4,
+    "klt.window_radius_px": 4,
+    "registration.n_iterations": 10,
+    "registration.pixel_sigma_px": 0.7,
+    "registration.sigma_factor": 1.2,
+    "stereo.offset_sigma_px": 0.1,
+    "stereo.patch_radius_px": 5,
+    "stereo.search_radius_px": 3,
+    "stereo.sigma_px": 0.3,
+    "window.kernel_threshold": None,
+    "window.zero_motion": False,
+    "window.zero_motion_flow_px": 1.0,
+    "window.zero_motion_gate": 5.0,
+    "window.zero_motion_sigma_factor": 1.0,
+}
 # what a number starts from where its default is null
 _STARTS: Mapping[tuple[str, str], float] = {
     ("depth", "scale"): 1000.0,
-    ("window", "kernel_threshold"): 3.55,
 }
 
 
@@ -98,13 +124,7 @@ class DepthConfig(Section):
         0.03, "maximum spread of depth in the window around a keypoint, relative to its depth", ge=0
     )
     edge_radius_px: int = _expert(2, "half size of that window", "px", ge=0, le=10)
-    virtual_baseline_m: float = _expert(
-        0.075, "baseline of the virtual stereo camera that sees the depth as disparity", "m", gt=0
-    )
     sigma_px: float = _expert(1.0, "standard deviation of the virtual disparity", "px", gt=0)
-    icp: Literal["auto", "always", "never"] = _expert(
-        "auto", "edges of their own by ICP of depth images (klt); auto: where colour contradicts"
-    )
 
 
 class FrontendConfig(Section):
@@ -119,30 +139,6 @@ class KltConfig(Section):
     """Corners tracked by Lucas-Kanade (frontend.kind: klt)."""
 
     n_corners: int = _common(250, "maximum corners per image", ge=50, le=20000)
-    min_eigenvalue: float = _expert(
-        1e-4, "minimum eigenvalue of a corner's gradient covariance, grey in [0, 1]", gt=0
-    )
-    min_distance_px: int = _expert(
-        10, "size of the cells with at most one corner each", "px", ge=2, le=200
-    )
-    cell_size_px: int = _expert(40, "size of the cells that share the budget", "px", ge=8)
-    window_radius_px: int = _expert(
-        4, "half size of the window that Lucas-Kanade begins with", "px", ge=2, le=50
-    )
-    n_levels: int = _expert(
-        2, "pyramid levels above the image, from a prediction; the finest is aligned", ge=1, le=8
-    )
-    n_wide_levels: int = _expert(
-        4, "pyramid levels above the image without a prediction, or after it failed", ge=0, le=8
-    )
-    max_return_px: float = _expert(0.5, "forward-backward error limit of a track", "px", gt=0)
-    pixel_sigma_px: float = _expert(0.15, "standard deviation of a tracked pixel", "px", gt=0)
-    disparity_sigma_px: float = _expert(
-        0.15, "standard deviation of the disparity of a corner or track, for stereo", "px", gt=0
-    )
-    sigma_factor: float = _expert(
-        2.4, "largest inflation of a registration's sigmas: errors of near tracks correlate", gt=0
-    )
 
 
 class FeaturesConfig(Section):
@@ -193,11 +189,7 @@ class StereoConfig(Section):
     subpixel: Literal["parabola", "none"] = _expert(
         "parabola", "disparity by a parabola through patch differences, or from the keypoints"
     )
-    patch_radius_px: int = _expert(5, "half size of the patches", "px", ge=1, le=20)
-    search_radius_px: int = _expert(3, "columns searched on either side", "px", ge=1, le=20)
-    sigma_px: float = _expert(0.3, "standard deviation of the disparity (descriptor)", "px", gt=0)
     estimate_offset: bool = _expert(True, "estimate the constant disparity error of the rig online")
-    offset_sigma_px: float = _expert(0.1, "prior standard deviation of that error", "px", gt=0)
 
 
 class TemporalConfig(Section):
@@ -240,20 +232,11 @@ class RegistrationConfig(Section):
     refine: Literal["gauss_newton", "none"] = _expert(
         "gauss_newton", "refinement of the pose on (u, v, disparity) residuals after RANSAC"
     )
-    n_iterations: int = _expert(
-        10, "maximum iterations after the inliers are chosen again", ge=1, le=100
-    )
     huber: float = _expert(
         1.5, "threshold of the Huber kernel on the whitened residual of a match", "sigma", gt=0
     )
     gate: float = _expert(
         3.0, "maximum whitened residual of an inlier of the refined pose", "sigma", gt=0
-    )
-    pixel_sigma_px: float = _expert(
-        0.7, "standard deviation of a keypoint's pixel (descriptor)", "px", gt=0
-    )
-    sigma_factor: float = _expert(
-        1.2, "inflation of sigmas (descriptor): errors of the matches correlate", gt=0
     )
 
 
@@ -285,12 +268,6 @@ class WindowConfig(Section):
         15.0, "rotation from all that makes a keyframe, if overlap is unknown", "deg", gt=0, le=180
     )
     kernel: Kernel = _expert("huber", "robust kernel of the edges")
-    kernel_threshold: float | None = _expert(
-        None,
-        "kernel threshold on the whitened residual norm (dcs: its square); null: huber 3.55, "
-        "cauchy 9.4, geman_mcclure 13.6, dcs 15.6",
-        gt=0,
-    )
     gate: float | None = _expert(
         10.0, "maximum disagreement with most other edges of the pose; null: any", "sigma", gt=0
     )
@@ -302,16 +279,6 @@ class WindowConfig(Section):
     )
     lost_after_s: float = _expert(
         2.0, "time without a registration until the camera is lost and a segment begins", "s", gt=0
-    )
-    zero_motion: bool = _expert(
-        False, "at standstill, add a zero-motion edge to the previous frame"
-    )
-    zero_motion_flow_px: float = _expert(1.0, "standstill: maximum median flow", "px", gt=0)
-    zero_motion_gate: float = _expert(
-        5.0, "standstill: maximum Mahalanobis norm of the motion", "sigma", gt=0
-    )
-    zero_motion_sigma_factor: float = _expert(
-        1.0, "sigmas of the zero-motion edge, relative to those of the registration", gt=0
     )
 
 
@@ -502,6 +469,8 @@ def _explain(error: ValidationError) -> str:
     name = cut(".".join(str(part) for part in first["loc"]), MAX_SHOWN)
     if first["type"] != "extra_forbidden":
         return f"{name}={shortened(first['input'])}: {first['msg'].lower()}; see `gvo config --all`"
+    if name in _FIXED:
+        return f"{name} is no parameter any more: it is fixed at {_yaml(_FIXED[name])}"
     known = list(values_by_name(Config()) if "." in name else sections())
     nearest = difflib.get_close_matches(name, known, n=1, cutoff=0.0)[0]
     return f"unknown key {name}: did you mean {nearest}? `gvo config --all` lists all"
@@ -544,9 +513,13 @@ def describe_configuration(config: Config, *, for_experts: bool = True) -> str:
         }
         lines += ["", f"# {group.__doc__}".rstrip("."), f"{section}:"] if fields else []
         for key, field in fields.items():
-            text = yaml.safe_dump(getattr(values, key)).splitlines()[0]
+            text = _yaml(getattr(values, key))
             lines.append(f"  {key}: {text}".ljust(34) + f"  # {describe_field(field)}")
     return "\n".join(lines[1:]) + "\n"
+
+
+def _yaml(value: Value) -> str:
+    return str(yaml.safe_dump(value).splitlines()[0])
 
 
 def is_expert(field: Any) -> bool:  # noqa: ANN401 - a field of pydantic's
@@ -627,7 +600,7 @@ def list_parameters() -> dict[str, list[Parameter]]:
 
 def _shown(section: str, key: str, field: Any) -> Parameter:  # noqa: ANN401
     options = get_args(field.annotation)
-    default = yaml.safe_dump(field.default).splitlines()[0]
+    default = _yaml(field.default)
     limits = _limits(field)
     kind = _kind(field.annotation)
     lower, upper = limits.get(">=", limits.get(">")), limits.get("<=")

@@ -535,7 +535,7 @@ class Estimate:
         )
 
 
-LinkKind: TypeAlias = Literal["step", "keyframe", "depth", "standstill"]
+LinkKind: TypeAlias = Literal["step", "keyframe", "depth"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -546,7 +546,7 @@ class FrameLink:
     ----------
     reference_ns : int
         Stamp of the earlier frame.
-    kind : {"step", "keyframe", "depth", "standstill"}
+    kind : {"step", "keyframe", "depth"}
         To the frame that the raw chain goes on from, to a keyframe, to a keyframe by depth alone,
         or without motion.
     chi2 : float or None

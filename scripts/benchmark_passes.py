@@ -119,7 +119,6 @@ ABLATION = (
         sensors=("stereo",),
     ),
     Row(name="global shutter, none learnt", settings=("camera.readout_ms=0",)),
-    Row(name="without edges by depth alone", settings=("depth.icp=never",), sensors=("rgbd",)),
     Row(name="without links to keyframes", settings=("window.n_links=1",)),
 )
 

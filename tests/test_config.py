@@ -62,7 +62,7 @@ def test_values_of_settings_are_yaml(text: str, value: float | None) -> None:
         ("window.sizee=5", "window.size"),
         ("ransac.n_hypothesis=5", "ransac.n_hypotheses"),
         ("features.n_feature=500", "features.n_features"),
-        ("stereo.sigma=1", "stereo.sigma_px"),
+        ("depth.sigma=1", "depth.sigma_px"),
     ],
 )
 def test_an_unknown_key_names_the_nearest(setting: str, nearest: str) -> None:
@@ -164,6 +164,15 @@ def test_an_unreadable_file_is_refused_by_name(tmp_path: Path) -> None:
     assert str(binary) in refusal(binary)
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("klt.max_return_px", "0.5"), ("window.kernel_threshold", "null"), ("depth.icp", "auto")],
+)
+def test_a_parameter_that_has_gone_is_refused_with_its_fixed_value(key: str, value: str) -> None:
+    message = refusal(None, (f"{key}=1",))
+    assert message == f"{key} is no parameter any more: it is fixed at {value}"
+
+
 def all_keys() -> list[tuple[str, str]]:
     return [(section, key) for section, values in Config().model_dump().items() for key in values]
 
@@ -202,7 +211,7 @@ def test_the_description_tells_unit_range_and_choices() -> None:
         line.split(":")[0].strip(): line for line in describe_configuration(Config()).split("\n")
     }
     assert "[1/m, > 0]" in lines["scale"]
-    assert "[px, >= 1, <= 20]" in lines["patch_radius_px"]
+    assert "[px, >= 0, <= 10]" in lines["edge_radius_px"]
     assert "none | huber | cauchy" in lines["kernel"]
 
 
@@ -213,7 +222,7 @@ changed = st.fixed_dictionaries(
         "features": st.fixed_dictionaries(
             {"kind": st.sampled_from(["orb", "sift", "fast", "gftt"]), "upright": st.booleans()}
         ),
-        "stereo": st.fixed_dictionaries({"sigma_px": st.floats(1e-300, 1e300)}),
+        "stereo": st.fixed_dictionaries({"row_tolerance_px": st.floats(1e-300, 1e300)}),
         "window": st.fixed_dictionaries(
             {
                 "size": st.none() | st.integers(2, 100),

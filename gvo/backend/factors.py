@@ -62,7 +62,7 @@ class Factors:
     Parameters
     ----------
     config : WindowConfig
-        Default kernel and its constant.
+        Default kernel.
 
     References
     ----------
@@ -75,12 +75,7 @@ class Factors:
     def __init__(self, config: WindowConfig) -> None:
         self.default = config.kernel
         self._estimators = {
-            kernel: create(
-                config.kernel_threshold
-                if kernel == config.kernel and config.kernel_threshold is not None
-                else _CONSTANTS[kernel]
-            )
-            for kernel, create in _KERNELS.items()
+            kernel: create(_CONSTANTS[kernel]) for kernel, create in _KERNELS.items()
         }
 
     def between(

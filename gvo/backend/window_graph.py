@@ -208,7 +208,7 @@ class WindowGraph:
     def reconfigure(self, config: WindowConfig) -> None:
         """Set another size, and another kernel for later measurements."""
         former, self._config = self._config, config
-        if (config.kernel, config.kernel_threshold) != (former.kernel, former.kernel_threshold):
+        if config.kernel != former.kernel:
             self._factors = Factors(config)
         if not self.poses:
             self._begin()

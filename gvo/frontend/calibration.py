@@ -42,6 +42,10 @@ from gvo.types import (
     Stamped,
 )
 
+# Largest inflation of the sigmas of a registration by tracks: errors of near ones correlate.
+KLT_SIGMA_FACTOR = 2.4
+# Prior standard deviation of the constant error of disparities.
+OFFSET_SIGMA_PX = 0.1
 # Names of what registrations tell.
 DISPARITY, READOUT = "disparity_px", "readout_s"
 # Errors of registrations are correlated (the same walls, the same lens): their sigmas are too small
@@ -298,8 +302,8 @@ class RigOffsets:
     Parameters
     ----------
     config : Config
-        `stereo.estimate_offset`, else the offsets stay at zero; `stereo.offset_sigma_px`, sigma
-        of their prior; `camera.readout_ms`, known or to be learnt.
+        `stereo.estimate_offset`, else the offsets stay at zero; `camera.readout_ms`, known or to
+        be learnt.
     is_stereo : bool
         Other sensors have no offsets.
 
@@ -320,7 +324,7 @@ class RigOffsets:
 
     def __init__(self, config: Config, *, is_stereo: bool = True) -> None:
         readout_ms = config.camera.readout_ms
-        self.disparity = ConstantFilter(config.stereo.offset_sigma_px, _DRIFT_PX)
+        self.disparity = ConstantFilter(OFFSET_SIGMA_PX, _DRIFT_PX)
         self.row = ConstantFilter(_ROW_PRIOR_PX, _DRIFT_PX)
         self.readout = (
             ConstantFilter(_READOUT_PRIOR_S, _DRIFT_S)
@@ -371,7 +375,7 @@ class RigOffsets:
     def reconfigure(self, config: Config) -> None:
         """Forget the variance factors where another front-end states other covariances."""
         # Matches of descriptors share a bias, and loops of them do: nothing is taken back there.
-        sigma_factor = config.klt.sigma_factor if config.frontend.kind == "klt" else 1.0
+        sigma_factor = KLT_SIGMA_FACTOR if config.frontend.kind == "klt" else 1.0
         if sigma_factor != self._sigma_factor:
             self._sigma_factor = sigma_factor
             self.chain_factor, self.window_factor = map(VarianceFactor, [sigma_factor] * 2)

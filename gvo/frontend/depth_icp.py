@@ -22,7 +22,6 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Literal
 from weakref import WeakKeyDictionary
 
 import cv2
@@ -290,22 +289,13 @@ class DepthTrust:
     If they differ by more over the last frames, one of the two is wrong in a way of its own: then
     those of depth are worth a measurement, with their covariance scaled to the difference, as if
     both were to blame by as many of their sigmas.
-
-    Parameters
-    ----------
-    mode : {"auto", "always", "never"}
     """
 
-    def __init__(self, mode: Literal["auto", "always", "never"]) -> None:
-        self.mode = mode
-        self._is_believed = False
+    def __init__(self) -> None:
+        self.is_on = False
+        """Whether depth is worth edges of its own."""
         self._n_unmeasured = 0
         self._squares: deque[float] = deque(maxlen=_N_REMEMBERED)
-
-    @property
-    def is_on(self) -> bool:
-        """Tell whether depth is worth edges of its own."""
-        return self.mode == "always" or (self.mode == "auto" and self._is_believed)
 
     @property
     def disagreement(self) -> float:
@@ -320,8 +310,6 @@ class DepthTrust:
 
     def is_due(self) -> bool:
         """Tell, once for each frame, whether its depth is to be aligned."""
-        if self.mode == "never":
-            return False
         self._n_unmeasured += 1
         is_judged = len(self._squares) >= _N_NEEDED
         every = _EVERY if self.is_on else _EVERY_AGREEING if is_judged else _EVERY_FIRST
@@ -335,7 +323,7 @@ class DepthTrust:
         difference = se3.log(se3.invert(colour.T_reference_current) @ depth.T_reference_current)
         square = se3.mahalanobis(difference, colour.covariance + depth.covariance)
         self._squares.append(float(square))
-        self._is_believed = self.disagreement > (_AGREES if self._is_believed else _CONTRADICTS)
+        self.is_on = self.disagreement > (_AGREES if self.is_on else _CONTRADICTS)
 
     def widen(self, covariance: FloatArray) -> FloatArray | None:
         """Return the covariance of an edge by depth; None where there is to be none, or not yet."""

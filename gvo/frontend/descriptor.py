@@ -30,6 +30,14 @@ from gvo.types import (
     StereoFrame,
 )
 
+# Standard deviations of a keypoint's pixel, and of its disparity, for stereo.
+_PIXEL_SIGMA_PX = 0.7
+_DISPARITY_SIGMA_PX = 0.3
+# Inflation of the sigmas of a registration: errors of the matches correlate.
+_SIGMA_FACTOR = 1.2
+# An RGB-D camera is treated as a stereo camera of this baseline, that of a Kinect.
+_VIRTUAL_BASELINE_M = 0.075
+
 
 class DescriptorFrontend:
     """Extracts observations from frames and registers two frames' observations.
@@ -50,7 +58,7 @@ class DescriptorFrontend:
         *,
         rig_offsets: RigOffsets | None = None,
     ) -> None:
-        self.camera = as_stereo(camera, config)
+        self.camera = as_stereo(camera)
         is_stereo = isinstance(camera, StereoCamera)
         self.rig_offsets = rig_offsets or RigOffsets(config, is_stereo=is_stereo)
         self._calibrated = CalibratedCamera(self.camera, self.rig_offsets)
@@ -128,8 +136,8 @@ class DescriptorFrontend:
         config = self._config
         is_sift = config.features.kind == "sift"
         level_ratio = 2.0 if is_sift else config.features.scale_factor
-        pixel = config.registration.pixel_sigma_px * level_ratio**octaves
-        disparity = config.stereo.sigma_px if is_stereo else config.depth.sigma_px
+        pixel = _PIXEL_SIGMA_PX * level_ratio**octaves
+        disparity = _DISPARITY_SIGMA_PX if is_stereo else config.depth.sigma_px
         return np.column_stack([pixel, pixel, np.full(len(octaves), disparity)])
 
     def register(
@@ -230,7 +238,7 @@ class DescriptorFrontend:
                 uvd=(measured.source_uvd, measured.target_uvd),
                 sigmas=(measured.source_sigmas, measured.target_sigmas),
                 matches=matches,
-                sigma_factor=self._config.registration.sigma_factor,
+                sigma_factor=_SIGMA_FACTOR,
             ),
             self._config,
             prior=prior,
@@ -258,8 +266,8 @@ class DescriptorFrontend:
         return match_temporal(reference, current, predicted, config, radius_px=radius_px)
 
 
-def as_stereo(camera: StereoCamera | PinholeCamera, config: Config) -> StereoCamera:
+def as_stereo(camera: StereoCamera | PinholeCamera) -> StereoCamera:
     """Return a stereo camera; an RGB-D camera gets the virtual baseline."""
     if isinstance(camera, StereoCamera):
         return camera
-    return StereoCamera.from_pinhole(camera, config.depth.virtual_baseline_m)
+    return StereoCamera.from_pinhole(camera, _VIRTUAL_BASELINE_M)

@@ -94,9 +94,8 @@ def _extraction(config: Config, is_stereo: bool) -> tuple[Any, ...]:
 
 def _kind(config: Config, is_stereo: bool) -> tuple[Any, ...]:
     """Return what must be equal for two frames to be registered."""
-    baseline_m = None if is_stereo else config.depth.virtual_baseline_m
     if config.frontend.kind == "klt":
-        return "klt", baseline_m
+        return ("klt",)
     features = config.features
     described = features.kind, features.n_octaves, features.scale_factor, features.upright
-    return "descriptor", baseline_m, *described
+    return "descriptor", *described

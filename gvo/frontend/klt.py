@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo._trace import note
-from gvo.config import Config, KltConfig
-from gvo.frontend.calibration import CalibratedCamera, Measurements, RigOffsets
+from gvo.config import Config
+from gvo.frontend.calibration import KLT_SIGMA_FACTOR, CalibratedCamera, Measurements, RigOffsets
 from gvo.frontend.depth_icp import DepthAligner
 from gvo.frontend.descriptor import as_stereo
 from gvo.frontend.features import describe_pixels, thin
@@ -22,7 +22,10 @@ from gvo.frontend.stereo.disparity import follow_disparities, measure_disparitie
 from gvo.frontend.stereo.matching import is_in_depth_range
 from gvo.frontend.stereo.patches import cut_patches
 from gvo.frontend.tracking import (
+    N_WIDE_LEVELS,
     RADIUS_PX,
+    SPACING_PX,
+    WINDOW_RADIUS_PX,
     Templates,
     detect_corners,
     halve,
@@ -49,6 +52,9 @@ from gvo.types import (
 )
 
 _MIN_DEPTH_M = 1e-3
+# Standard deviations of a tracked pixel, and of the disparity of a corner or track, for stereo.
+_PIXEL_SIGMA_PX = 0.15
+_DISPARITY_SIGMA_PX = 0.15
 # Gauss-Newton steps from the predicted disparity of a track.
 _N_TRACK_STEPS = 4
 # An alignment that ends farther from its track was of something else.
@@ -94,7 +100,7 @@ class KltFrontend:
         *,
         rig_offsets: RigOffsets | None = None,
     ) -> None:
-        self.camera = as_stereo(camera, config)
+        self.camera = as_stereo(camera)
         self._is_stereo = isinstance(camera, StereoCamera)
         self.rig_offsets = rig_offsets or RigOffsets(config, is_stereo=self._is_stereo)
         self._calibrated = CalibratedCamera(self.camera, self.rig_offsets)
@@ -110,12 +116,14 @@ class KltFrontend:
         """
         self.rig_offsets.advance()
         half = halve(image_of(frame))
-        corners = self._find_corners(frame, half, self._config.klt)
+        corners = self._find_corners(frame, half, self._config.klt.n_corners)
         return KltObservations(frame=frame, half=half, corners=corners)
 
-    def _find_corners(self, frame: Frame, half: ImageArray, klt: KltConfig) -> KltCorners:
+    def _find_corners(
+        self, frame: Frame, half: ImageArray, n_corners: int, *, spacing_px: int = SPACING_PX
+    ) -> KltCorners:
         offset_px, row_offset_px = self.rig_offsets.disparity_px, self.rig_offsets.row.value
-        corners = detect_corners(image_of(frame), klt, half=half)
+        corners = detect_corners(image_of(frame), n_corners, spacing_px=spacing_px, half=half)
         row_px = None
         if isinstance(frame, StereoFrame):
             config, images = self._config.stereo, (frame.left, frame.right)
@@ -253,14 +261,10 @@ class KltFrontend:
 
     def describe_densely(self, observations: KltObservations) -> KltPlace:
         """Return a frame as a place with more corners, which find more of another place's."""
-        klt = self._config.klt
-        dense = klt.model_copy(
-            update={
-                "n_corners": _DENSITY * klt.n_corners,
-                "min_distance_px": 2 * klt.min_distance_px // 3,
-            }
+        n_corners, spacing_px = _DENSITY * self._config.klt.n_corners, 2 * SPACING_PX // 3
+        corners = self._find_corners(
+            observations.frame, observations.half, n_corners, spacing_px=spacing_px
         )
-        corners = self._find_corners(observations.frame, observations.half, dense)
         return self._describe(observations, corners)
 
     def _describe(self, observations: KltObservations, corners: KltCorners) -> KltPlace:
@@ -393,11 +397,10 @@ class KltFrontend:
 
     def _sigmas(self, n: int) -> tuple[FloatArray, FloatArray]:
         """Return the sigmas of (u, v, disparity) of corners and of their tracks."""
-        klt = self._config.klt
-        disparity = klt.disparity_sigma_px if self._is_stereo else self._config.depth.sigma_px
+        disparity = _DISPARITY_SIGMA_PX if self._is_stereo else self._config.depth.sigma_px
         # A corner is where it was cut out: only the track into the current frame is noisy.
         corner = [0.0, 0.0, disparity]
-        track = [klt.pixel_sigma_px, klt.pixel_sigma_px, disparity]
+        track = [_PIXEL_SIGMA_PX, _PIXEL_SIGMA_PX, disparity]
         return np.tile(corner, (n, 1)), np.tile(track, (n, 1))
 
     def _track(
@@ -414,7 +417,7 @@ class KltFrontend:
             method="tracks",
             prior=expected.T_reference_current,
             is_wide=search == "wide",
-            radius_px=float(self._config.klt.window_radius_px),
+            radius_px=float(WINDOW_RADIUS_PX),
             source_uvd=reference.uvd,
             indices=expected.indices,
             predicted=expected.uvd,
@@ -433,7 +436,7 @@ class KltFrontend:
             uvd=(reference.uvd.take(indices, axis=0), target_uvd),
             sigmas=self._sigmas(len(indices)),
             matches=np.column_stack([indices, np.full_like(indices, -1)]),
-            sigma_factor=self._config.klt.sigma_factor,
+            sigma_factor=KLT_SIGMA_FACTOR,
         )
 
     def _predict(
@@ -480,13 +483,12 @@ class KltFrontend:
         start = expected.uvd[:, :2]
         if search == "aligned":
             return self._align(reference, current, expected, start)
-        klt = self._config.klt
         kept = cast(KltObservations, reference)  # a place is only aligned
         places = kept.keypoints[expected.indices], start
         if search == "wide":
-            images, n_levels = (kept.image, current.image), klt.n_wide_levels
-            return track_pixels(images, *places, klt, n_levels=n_levels, is_checked=True)
-        pixels, is_tracked = track_roughly((kept.half, current.half), *places, klt)
+            images = kept.image, current.image
+            return track_pixels(images, *places, n_levels=N_WIDE_LEVELS, is_checked=True)
+        pixels, is_tracked = track_roughly((kept.half, current.half), *places)
         tracked = np.flatnonzero(is_tracked)
         roughly = pixels.take(tracked, axis=0)
         aligned, is_found = self._align(reference, current, expected.take(tracked), roughly)

@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gvo.config import KltConfig
 from gvo.frontend.features import choose_spread
 from gvo.frontend.stereo.patches import cut_patches, steps_around
 from gvo.geometry.camera import StereoCamera
@@ -30,6 +29,19 @@ _BACK_LEVELS = 0
 # Corners are detected at half resolution, at a quarter of the cost: a patch need not be centred on
 # its corner exactly, as it is tracked and measured wherever it is.
 _REDUCTION = 2
+# Smallest eigenvalue of a corner's gradient covariance, grey in [0, 1]: below it noise is tracked.
+_MIN_EIGENVALUE = 1e-4
+# Sides of the cells with at most one corner each, and of those that share the number of corners.
+SPACING_PX = 10
+CELL_SIZE_PX = 40
+# Half size of the window that Lucas-Kanade compares.
+WINDOW_RADIUS_PX = 4
+# Levels of the pyramid above the halved image from a prediction; above the image itself without
+# one, or after it failed.
+_N_HALF_LEVELS = 1
+N_WIDE_LEVELS = 4
+# Largest error of a track that is followed back to its corner.
+_MAX_RETURN_PX = 0.5
 # Side of the square over which the gradients are summed, there.
 _BLOCK_PX = 3
 # Half size of the patches, and the offsets of their pixels, homogeneous.
@@ -59,7 +71,6 @@ def track_pixels(
     images: tuple[ImageArray, ImageArray],
     pixels: FloatArray,
     start: FloatArray,
-    config: KltConfig,
     *,
     n_levels: int,
     is_checked: bool,
@@ -74,8 +85,6 @@ def track_pixels(
         In the first image.
     start : ndarray of float64, shape (n, 2)
         Where the search in the second image begins.
-    config : KltConfig
-        Window, forward-backward error limit.
     n_levels : int
         Levels of the pyramid above the image itself.
     is_checked : bool
@@ -92,20 +101,17 @@ def track_pixels(
     if len(pixels) == 0:
         return np.zeros((0, 2)), np.zeros(0, dtype=np.bool_)
     first, begin = pixels.astype(np.float32), start.astype(np.float32)
-    tracked, is_found = _follow(images, first, begin, config, n_levels=n_levels)
+    tracked, is_found = _follow(images, first, begin, n_levels=n_levels)
     if is_checked:
-        back, is_back = _follow(images[::-1], tracked, first.copy(), config, n_levels=_BACK_LEVELS)
-        is_found &= is_back & (np.linalg.norm(back - first, axis=1) <= config.max_return_px)
+        back, is_back = _follow(images[::-1], tracked, first.copy(), n_levels=_BACK_LEVELS)
+        is_found &= is_back & (np.linalg.norm(back - first, axis=1) <= _MAX_RETURN_PX)
     height, width = images[1].shape
     is_inside = np.all((tracked >= 0) & (tracked <= [width - 1, height - 1]), axis=1)
     return tracked.astype(np.float64), is_found & is_inside
 
 
 def track_roughly(
-    halves: tuple[ImageArray, ImageArray],
-    pixels: FloatArray,
-    start: FloatArray,
-    config: KltConfig,
+    halves: tuple[ImageArray, ImageArray], pixels: FloatArray, start: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
     """Track pixels from a good prediction in images of half the size; as `track_pixels`.
 
@@ -114,7 +120,7 @@ def track_roughly(
     # The centre of a pixel of the half image is between those of four.
     first, begin = (0.5 * each - 0.25 for each in (pixels, start))
     tracked, is_tracked = track_pixels(
-        halves, first, begin, config, n_levels=config.n_levels - 1, is_checked=False
+        halves, first, begin, n_levels=_N_HALF_LEVELS, is_checked=False
     )
     return 2.0 * tracked + 0.5, is_tracked
 
@@ -123,11 +129,10 @@ def _follow(
     images: tuple[ImageArray, ...],
     pixels: NDArray[np.float32],
     start: NDArray[np.float32],
-    config: KltConfig,
     *,
     n_levels: int,
 ) -> tuple[NDArray[np.float32], BoolArray]:
-    size = 2 * config.window_radius_px + 1
+    size = 2 * WINDOW_RADIUS_PX + 1
     tracked, is_found, _ = cv2.calcOpticalFlowPyrLK(
         images[0],
         images[1],
@@ -143,18 +148,24 @@ def _follow(
 
 
 def detect_corners(
-    image: ImageArray, config: KltConfig, *, half: ImageArray | None = None
+    image: ImageArray,
+    n_corners: int,
+    *,
+    spacing_px: int = SPACING_PX,
+    half: ImageArray | None = None,
 ) -> FloatArray:
     """Detect the corners of an image, to two pixels.
 
     The score of a pixel is the smaller eigenvalue of its gradients' covariance. Each cell of
-    `min_distance_px` gives its best local maximum; these share the budget over larger cells.
+    `spacing_px` gives its best local maximum; these share the budget over larger cells.
 
     Parameters
     ----------
     image : ndarray of uint8, shape (height, width)
-    config : KltConfig
-        Number of corners, weakest score, distances.
+    n_corners : int
+        The largest number returned.
+    spacing_px : int
+        Side of the cells with at most one corner each.
     half : ndarray of uint8, optional
         The image halved, where it is at hand.
 
@@ -163,29 +174,27 @@ def detect_corners(
     ndarray of float64, shape (n, 2)
         Whole pixels (u, v), with room for the window that is tracked.
     """
-    border = (config.window_radius_px + 1) // _REDUCTION + 1
+    border = (WINDOW_RADIUS_PX + 1) // _REDUCTION + 1
     if min(image.shape) // _REDUCTION <= 2 * border:
         return np.zeros((0, 2))
     half = halve(image) if half is None else half
-    pixels, responses = _local_maxima(half, config.min_eigenvalue, border)
-    best = _best_of_cells(pixels, responses, config.min_distance_px, width=image.shape[1])
+    pixels, responses = _local_maxima(half, border)
+    best = _best_of_cells(pixels, responses, spacing_px, width=image.shape[1])
     chosen = choose_spread(
         pixels[best],
         responses[best],
         width=image.shape[1],
-        cell_size_px=config.cell_size_px,
-        n_chosen=config.n_corners,
+        cell_size_px=CELL_SIZE_PX,
+        n_chosen=n_corners,
     )
     return pixels[best[chosen]].astype(np.float64)
 
 
-def _local_maxima(
-    reduced: ImageArray, min_eigenvalue: float, border: int
-) -> tuple[IntArray, NDArray[np.float32]]:
+def _local_maxima(reduced: ImageArray, border: int) -> tuple[IntArray, NDArray[np.float32]]:
     """Return pixels of the full image, shape (n, 2), and their scores, shape (n,)."""
     scores = cv2.cornerMinEigenVal(reduced, _BLOCK_PX)
     neighbours = cv2.dilate(scores, np.ones((3, 3), dtype=np.uint8))
-    is_corner = (scores == neighbours) & (scores > min_eigenvalue)
+    is_corner = (scores == neighbours) & (scores > _MIN_EIGENVALUE)
     # The indices of a flat array are found several times faster than those of two axes.
     found = np.flatnonzero(is_corner[border:-border, border:-border])
     rows, columns = np.divmod(found, reduced.shape[1] - 2 * border)

@@ -36,6 +36,8 @@ from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.residuals import Linearization, StereoResiduals, pose_jacobian, whiten_in_place
 from gvo.types import BoolArray, ConstantError, Failure, FloatArray
 
+# Iterations at most after the inliers are chosen again.
+_N_ITERATIONS = 10
 # Squared length of a step, in sigmas, that no longer matters.
 _CONVERGED = 1e-3
 # Root mean square change of the residuals in sigmas, about a pixel, up to which the Jacobian is
@@ -112,7 +114,7 @@ def refine_pose(
     camera : StereoCamera
         Of both frames.
     config : RegistrationConfig
-        Iterations, kernel threshold, gate.
+        Kernel threshold, gate.
 
     Returns
     -------
@@ -121,10 +123,11 @@ def refine_pose(
     """
     residuals = StereoResiduals.of(T_target_source, matches, camera, huber=config.huber)
     note("refinement.begin", residuals=residuals)
-    n_first = min(_N_FIRST_ITERATIONS, config.n_iterations)
     # Unobservable directions may give steps that are not finite; they are checked.
     with np.errstate(over="ignore", invalid="ignore"):
-        rough = _gauss_newton(T_target_source, residuals.select(inliers), n_iterations=n_first)
+        rough = _gauss_newton(
+            T_target_source, residuals.select(inliers), n_iterations=_N_FIRST_ITERATIONS
+        )
         if isinstance(rough, Failure):
             return rough
         chosen = residuals.within(rough, config.gate)
@@ -132,7 +135,7 @@ def refine_pose(
             chosen = inliers
         note("refinement.gated", T_target_source=rough, inliers=chosen)
         every, residuals = residuals, residuals.select(chosen)
-        T = _gauss_newton(rough, residuals, n_iterations=config.n_iterations)
+        T = _gauss_newton(rough, residuals, n_iterations=_N_ITERATIONS)
         if isinstance(T, Failure):
             return T
         # Orthonormal to the last digit: many motions are composed with this one.

@@ -14,7 +14,7 @@ import numpy as np
 from gvo._trace import note
 from gvo.backend.keyframe_policy import choose_unseen, is_needed
 from gvo.backend.window import SlidingWindow
-from gvo.config import Config, WindowConfig
+from gvo.config import Config
 from gvo.frontend.calibration import RigOffsets
 from gvo.frontend.depth_icp import DepthTrust
 from gvo.frontend.descriptor import as_stereo
@@ -98,7 +98,7 @@ class Odometry:
         self._anchor_ns: int | None = None
         self._previous: Estimate | None = None  # by the raw chain
         self._begin_map()
-        self._trust = DepthTrust(self._config.depth.icp)
+        self._trust = DepthTrust()
         # The last frame and the last registered one, to be extracted again after a change.
         self._frames: dict[int, Stamped] = {}
 
@@ -141,10 +141,9 @@ class Odometry:
           keep their kernel.
         - `frontend`, `klt` or `features`, `stereo` or `depth`, as the sensor and the front-end
           use them: the last frame is extracted again. Keyframes stay where they can be registered
-          with new frames. They cannot after another `frontend.kind`,
-          `depth.virtual_baseline_m`, or `kind`, `n_octaves`, `scale_factor` or `upright` of
-          `features` (descriptor): then KLT keyframes, which hold their images, are extracted
-          again, and those of descriptors are released.
+          with new frames. They cannot after another `frontend.kind`, or `kind`, `n_octaves`,
+          `scale_factor` or `upright` of `features` (descriptor): then KLT keyframes, which hold
+          their images, are extracted again, and those of descriptors are released.
         - `camera`, `stereo`: what was learnt of the camera is estimated anew.
         - `loops`, `runtime`: with the next frame. Where loops were not enabled, the map and the
           global poses begin with it.
@@ -278,7 +277,7 @@ class Odometry:
     def _view(self) -> StereoCamera | None:
         """Return the camera of the view overlap."""
         view = self._frontend.camera or self._camera
-        return None if view is None else as_stereo(view, self._config)
+        return None if view is None else as_stereo(view)
 
     def _take_over_configuration(self) -> None:
         """Take over another configuration before a frame."""
@@ -287,7 +286,6 @@ class Odometry:
             return
         extracted = {} if self._is_own else self._renew_frontend(former)
         self._window.reconfigure(self._config.window)
-        self._trust.mode = self._config.depth.icp
         self._keyframes.reconfigure(self._view(), self._config.window)
         self._chain.reconfigure(self._frontend, self._config.window, extracted)
         self._graph.reconfigure(self._config.window)
@@ -354,8 +352,7 @@ class Odometry:
             measure, scores, T_frame_keyframes, step, config, n_unasked=n_unasked
         )
         offered += [("keyframe", edge) for edge in links]
-        still = zero_motion_edge(step, config)
-        return scores, offered if still is None else [*offered, ("standstill", still)]
+        return scores, offered
 
     def _predict_keyframes(self, step: RawStep) -> dict[int, FloatArray]:
         """Return T_frame_keyframe by stamp, of joined segments, as predicted by the step."""
@@ -591,28 +588,6 @@ def _check_frame(frame: Stamped, camera: StereoCamera | PinholeCamera) -> None:
         raise ValueError(
             f"the images are {width}x{height} pixels, the camera is {camera.width}x{camera.height}"
         )
-
-
-def zero_motion_edge(step: RawStep, config: WindowConfig) -> Edge | None:
-    """Return a zero-motion edge to the predecessor at standstill, else None.
-
-    Both are required: little flow in the image, and a motion insignificant against its
-    covariance, so that a slow but significant motion is not frozen.
-    """
-    if not config.zero_motion or step.registration is None:
-        return None
-    flow_px = step.registration.flow_px
-    if flow_px is None or flow_px > config.zero_motion_flow_px:
-        return None
-    twist = se3.log(step.T_reference_frame)
-    significance = np.sqrt(se3.mahalanobis(twist, step.covariance))
-    if significance > config.zero_motion_gate:
-        return None
-    return Edge(
-        reference_id=step.reference_ns,
-        T_reference_frame=np.eye(4),
-        covariance=config.zero_motion_sigma_factor**2 * step.covariance,
-    )
 
 
 class Stopwatch:

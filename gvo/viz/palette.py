@@ -24,7 +24,7 @@ STATUSES = {
 }
 """Of the statuses of frames, which have hatches and rows of their own too."""
 HATCHES = {"ok": "", "coasting": "////", "lost": "xxxx", "resumed": "....", "skipped": ""}
-LINKS = {"step": "#0072B2", "keyframe": "#CC79A7", "depth": "#009E73", "standstill": "#999999"}
+LINKS = {"step": "#0072B2", "keyframe": "#CC79A7", "depth": "#009E73"}
 """Of the kinds of edges."""
 REFUSED = "#D55E00"
 STAGES = {

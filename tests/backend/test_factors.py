@@ -92,17 +92,6 @@ def test_a_residual_names_the_weight_of_its_kernel(kernel: Kernel) -> None:
     assert found.chi2 == pytest.approx(36.0)
 
 
-def test_a_configured_constant_replaces_that_of_the_configured_kernel_alone() -> None:
-    factors = Factors(WindowConfig(kernel="huber", kernel_threshold=2.0))
-    weights = {}
-    kernels: tuple[Kernel, ...] = ("huber", "cauchy")
-    for kernel in kernels:
-        far = replace(edge("a", shifted(8.0), 1.0), kernel=kernel)
-        weights[kernel] = factors.residual_of_edge(far, "b", np.eye(4), np.eye(4)).weight
-    assert weights["huber"] == pytest.approx(0.25)
-    assert weights["cauchy"] == pytest.approx(1.0 / (1.0 + (8.0 / 9.4) ** 2))
-
-
 def test_a_position_weighs_along_the_axes_of_the_world() -> None:
     prior = PositionPrior(position_world=np.zeros(3), covariance=np.diag([1.0, 4.0, 9.0]))
     T = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.3, 0.4, 0.5), np.array([1.0, 2.0, 3.0]))

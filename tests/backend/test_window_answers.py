@@ -461,7 +461,7 @@ def test_many_poses_leave_a_few_at_a_time() -> None:
 def test_an_edge_keeps_the_kernel_that_it_went_in_with() -> None:
     window, _ = reconfigured({}, WindowConfig(kernel="none", gate=None, size=10), 4)
     rng = np.random.default_rng(5)
-    window.reconfigure(WindowConfig(kernel="cauchy", kernel_threshold=0.5, gate=None, size=10))
+    window.reconfigure(WindowConfig(kernel="cauchy", gate=None, size=10))
     window.add_pose(4, 4 * STEP_NS, [edge_to(3, 1, rng), edge_to(2, 2, rng)])
     weights = {(edge.reference_id, edge.frame_id): edge.weight for edge in window.graph()}
     assert all(weight == 1.0 for (_, frame), weight in weights.items() if frame != 4)
@@ -497,7 +497,6 @@ configurations = st.builds(
     WindowConfig,
     size=st.none() | st.integers(2, 30),
     kernel=st.sampled_from(["none", "huber", "cauchy", "geman_mcclure", "dcs"]),
-    kernel_threshold=st.none() | st.floats(0.1, 20.0),
     gate=st.none() | st.floats(0.5, 20.0),
     lost_after_s=st.floats(0.1, 5.0),
     coasting_sigma_m_per_s=st.floats(0.01, 100.0),

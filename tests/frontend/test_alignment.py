@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gvo.config import KltConfig
 from gvo.frontend.tracking import Templates, detect_corners, move_slopes, patch_warps, track_pixels
 from gvo.geometry.camera import StereoCamera
 from gvo.types import FloatArray
@@ -31,7 +30,7 @@ def seen_at(pixels: FloatArray, warp: FloatArray) -> FloatArray:
 
 def align(warp: FloatArray, *, brighter: int = 0) -> tuple[FloatArray, FloatArray]:
     """Return the errors of patches found from a start that is off by a pixel, and of tracks."""
-    corners, rng = detect_corners(analytic.image(), KltConfig()), np.random.default_rng(2)
+    corners, rng = detect_corners(analytic.image(), 250), np.random.default_rng(2)
     pixels = corners[np.all(np.abs(corners - analytic.MIDDLE) < [85.0, 35.0], axis=1)]
     truth = seen_at(pixels, warp)
     start = truth + rng.uniform(-0.9, 0.9, truth.shape)
@@ -42,7 +41,7 @@ def align(warp: FloatArray, *, brighter: int = 0) -> tuple[FloatArray, FloatArra
     found, is_found = templates.align(brightened, start, warps)
     assert np.mean(is_found) > 0.95
     tracked, is_tracked = track_pixels(
-        (analytic.image(), image), pixels, start, KltConfig(), n_levels=2, is_checked=False
+        (analytic.image(), image), pixels, start, n_levels=2, is_checked=False
     )
     errors, of_tracks = (np.linalg.norm(each - truth, axis=1) for each in (found, tracked))
     return errors[is_found], of_tracks[is_tracked]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import gvo
-from gvo.config import Config, DepthConfig
+from gvo.config import DepthConfig
 from gvo.frontend.depth_icp import DepthAligner, DepthMap, DepthTrust, align_depth_maps
 from gvo.frontend.descriptor import as_stereo
 from gvo.geometry import se3
@@ -25,7 +25,7 @@ STEP = np.array([0.02, -0.025, 0.015, 0.02, -0.03, 0.035])  # 2 degrees, 5 cm
 def recording() -> tuple[gvo.StereoCamera, list[RgbdFrame], FloatArray]:
     rendered = SyntheticRecording("handheld", "rgbd", n_frames=N_FRAMES, scale=SCALE)
     frames = [frame for frame in gvo.frames(rendered) if isinstance(frame, RgbdFrame)]
-    camera = as_stereo(rendered.info.camera, Config())
+    camera = as_stereo(rendered.info.camera)
     return camera, frames, rendered.ground_truth().T_world_frame
 
 
@@ -136,7 +136,7 @@ def measured_twice(
 
 
 def test_depth_that_agrees_is_tried_now_and_then_and_gives_no_edge() -> None:
-    trust = DepthTrust("auto")
+    trust = DepthTrust()
     assert feed(trust, 1.0, n=400) < 40
     assert not trust.is_on
     assert trust.disagreement == pytest.approx(1.0, rel=0.5)
@@ -144,7 +144,7 @@ def test_depth_that_agrees_is_tried_now_and_then_and_gives_no_edge() -> None:
 
 
 def test_depth_that_contradicts_gives_edges_as_wide_as_the_contradiction() -> None:
-    trust = DepthTrust("auto")
+    trust = DepthTrust()
     feed(trust, 8.0, n=200)
     assert trust.is_on
     widened = trust.widen(np.eye(6))
@@ -153,13 +153,6 @@ def test_depth_that_contradicts_gives_edges_as_wide_as_the_contradiction() -> No
     np.testing.assert_allclose(widened, 2.0 * 8.0**2 * np.eye(6), rtol=0.5)
     feed(trust, 1.0, n=100)
     assert not trust.is_on
-
-
-def test_never_and_always_are_kept_whatever_colour_says() -> None:
-    never, always = DepthTrust("never"), DepthTrust("always")
-    assert feed(never, 8.0) == 0
-    assert feed(always, 1.0) == 20
-    assert (never.is_on, always.is_on) == (False, True)
 
 
 @functools.cache
@@ -171,10 +164,10 @@ def small() -> tuple[gvo.PinholeCamera, list[RgbdFrame]]:
     ]
 
 
-def depth_links(mode: str, shift_px: int, n_frames: int) -> int:
+def depth_links(shift_px: int, n_frames: int) -> int:
     """Return the number of depth edges of a run whose depth is moved against colour."""
     camera, frames = small()
-    odometry = gvo.Odometry(camera, gvo.load_configuration(settings=[f"depth.icp={mode}"]))
+    odometry = gvo.Odometry(camera)
     n_links = 0
     for frame in frames[:n_frames]:
         moved = np.roll(frame.depth, shift_px, axis=1)
@@ -186,7 +179,5 @@ def depth_links(mode: str, shift_px: int, n_frames: int) -> int:
 
 
 def test_depth_edges_are_off_where_depth_is_registered_and_on_where_it_is_not() -> None:
-    assert depth_links("auto", 0, 80) == 0
-    assert depth_links("auto", 8, 80) > 10
-    assert depth_links("always", 0, 80) > 10
-    assert depth_links("never", 8, 40) == 0
+    assert depth_links(0, 80) == 0
+    assert depth_links(8, 80) > 10

@@ -69,7 +69,7 @@ def rgbd_frame(x_m: float = 0.0, stamp_ns: int = 0) -> RgbdFrame:
 def configure(kind: Kind = "orb", threads: int = 1, **sections: dict[str, object]) -> Config:
     values: dict[str, dict[str, object]] = {
         "features": {"kind": kind, "n_features": 400, "n_octaves": 1},
-        "stereo": {"min_depth_m": 0.6, "max_depth_m": 20.0, "sigma_px": 0.3},
+        "stereo": {"min_depth_m": 0.6, "max_depth_m": 20.0},
         "depth": {
             "min_depth_m": 0.5,
             "max_depth_m": 10.0,
@@ -79,7 +79,6 @@ def configure(kind: Kind = "orb", threads: int = 1, **sections: dict[str, object
         },
         "temporal": {"radius_px": 6.0, "wide_radius_px": 40.0, "max_distance": 0.25},
         "ransac": {"n_hypotheses": 100, "min_inliers": 12, "min_disparity_px": 2.0},
-        "registration": {"pixel_sigma_px": 0.7},
         "runtime": {"threads": threads},
     }
     for name, changes in sections.items():
@@ -175,12 +174,11 @@ def test_points_of_unknown_depth_are_left_out() -> None:
 
 
 def test_an_rgbd_camera_is_seen_as_a_stereo_camera_of_the_virtual_baseline() -> None:
-    config = configure(depth={"virtual_baseline_m": 0.05})
-    camera = as_stereo(COLOUR, config)
-    assert camera.baseline == 0.05
+    camera = as_stereo(COLOUR)
+    assert camera.baseline == 0.075
     np.testing.assert_array_equal(camera.K, COLOUR.K)
     assert (camera.width, camera.height) == (320, 200)
-    assert as_stereo(CAMERA, config) is CAMERA
+    assert as_stereo(CAMERA) is CAMERA
 
 
 @pytest.mark.parametrize("blank", ["both", "left", "right"])

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvo.config import Config, DepthConfig
+from gvo.config import DepthConfig
 from gvo.frontend.descriptor import as_stereo
 from gvo.frontend.rgbd import (
     check_depths,
@@ -24,7 +24,7 @@ RECORDING = SyntheticRecording("handheld", "rgbd", n_frames=31, scale=1.0)
 IMAGES = list(RECORDING.images())
 T_WORLD_CAM = RECORDING.ground_truth().T_world_frame
 CONFIG = DepthConfig()
-CAMERA = as_stereo(RECORDING.info.camera, Config())
+CAMERA = as_stereo(RECORDING.info.camera)
 
 
 def flat(value: float = 2.0) -> DepthArray:

@@ -24,7 +24,7 @@ from tests.geometry.scenes import (
 )
 
 CAMERA = StereoCamera(fx=700.0, fy=690.0, cx=600.0, cy=180.0, width=1226, height=370, baseline=0.5)
-SETTINGS = RegistrationConfig(n_iterations=20, huber=2.8, gate=5.0)
+SETTINGS = RegistrationConfig(huber=2.8, gate=5.0)
 SIGMA = 0.2
 
 

@@ -27,9 +27,9 @@ from tests.geometry.scenes import (
     unproject,
 )
 
-SETTINGS = RegistrationConfig(n_iterations=20, huber=2.8, gate=4.0, pixel_sigma_px=0.7)
+SETTINGS = RegistrationConfig(huber=2.8, gate=4.0)
 # Kernel and gate out of reach leave plain least squares, of which the theory is exact.
-WIDE = RegistrationConfig(n_iterations=50, huber=1e6, gate=1e6)
+WIDE = RegistrationConfig(huber=1e6, gate=1e6)
 SIGMAS = np.array([0.7, 0.7, 0.3])
 
 

@@ -360,7 +360,7 @@ def call(name, type_, asked, answered):
 
 listed = call("list_parameters", "ListParameters", Under(77, 1, ["loops", "runtime"], 0), Listed)
 say(*listed.names, *listed.prefixes)
-names = ["klt.n_corners", "camera.readout_ms", "depth.icp", "klt.none"]
+names = ["klt.n_corners", "camera.readout_ms", "frontend.kind", "klt.none"]
 values = call("get_parameters", "GetParameters", Names(77, 2, names), Values).values
 say(*((v.type, v.integer_value, v.string_value) for v in values))
 say(call("get_parameter_types", "GetParameterTypes", Names(77, 3, names), Types).types)
@@ -371,9 +371,9 @@ for each in known.descriptors:
 new = [
     Parameter("klt.n_corners", Value(type=2, integer_value=100)),
     Parameter("camera.readout_ms", Value(type=3, double_value=12.5)),
-    Parameter("depth.icp", Value(type=4, string_value="perhaps")),
+    Parameter("frontend.kind", Value(type=4, string_value="perhaps")),
     Parameter("klt.none", Value(type=1, bool_value=True)),
-    Parameter("klt.n_levels", Value(type=7, integer_array_value=[1])),
+    Parameter("ransac.seed", Value(type=7, integer_array_value=[1])),
 ]
 results = call("set_parameters", "SetParameters", New(77, 5, new), Results).results
 say(*(each.successful for each in results))
@@ -389,14 +389,14 @@ for changes in (both, both[:1]):
     LINES.get()
 """)
     assert other.line() == "loops.enabled runtime.threads loops runtime"
-    assert other.line() == "(2, 250, '') (0, 0, '') (4, 0, 'auto') (0, 0, '')"
+    assert other.line() == "(2, 250, '') (0, 0, '') (4, 0, 'klt') (0, 0, '')"
     assert other.line() == "[2, 0, 4, 0]"
     assert other.line() == "klt.n_corners 2  False (50, 20000)"
     assert other.line() == "camera.readout_ms 0  True (-100.0, 100.0)"
-    assert other.line() == "depth.icp 4 auto, always, never False"
+    assert other.line() == "frontend.kind 4 klt, descriptor False"
     assert other.line() == "klt.none 0  False"
     assert other.line() == "True True False False False"
-    assert "depth.icp" in other.line()
+    assert "frontend.kind" in other.line()
     assert other.line() == "there is no parameter klt.none"
     assert other.line() == "no parameter is an array"
     assert other.line() == "False"

@@ -10,13 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
-from gvo.config import CameraConfig, Config, FrontendConfig, WindowConfig
+from gvo.config import CameraConfig, Config, FrontendConfig
 from gvo.frontend.calibration import RigOffsets
 from gvo.frontend.klt import KltFrontend
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
-from gvo.odometry.chain import RawStep
-from gvo.odometry.odometry import Odometry, zero_motion_edge
+from gvo.odometry.odometry import Odometry
 from gvo.types import (
     DepthArray,
     Estimate,
@@ -603,62 +602,10 @@ def path_length(estimates: Iterable[Estimate]) -> float:
     return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
 
 
-@pytest.mark.parametrize("kind", ["klt", "descriptor"])
-def test_edges_without_motion_still_a_camera_that_stands(kind: str) -> None:
-    configurations = [
-        with_known_readout(
-            Config.model_validate(
-                configure(zero_motion=switch).model_dump() | {"frontend": {"kind": kind}}
-            )
-        )
-        for switch in (False, True)
-    ]
-    (off, smoothed_off), (on, smoothed_on) = (walk([0.0] * 14, c) for c in configurations)
-    # In the window from the second frame on; the raw chain knows nothing of them.
-    assert sum(r.n_links for r in on) >= sum(r.n_links for r in off) + 10
-    assert same_estimates((r.raw for r in on), (r.raw for r in off))
-    assert path_length(smoothed_on) < 0.9 * path_length(smoothed_off)
-
-
 def test_a_creeping_camera_is_not_frozen() -> None:
     steps = 0.005 * np.arange(33)
-    results, smoothed = walk(steps, configure_klt(zero_motion=True))
+    _, smoothed = walk(steps, configure_klt())
     true_length = float(steps[-1] * np.hypot(1.0, 0.5))
     went = np.linalg.norm(smoothed[-1].T_world_frame[:3, 3])
     assert went == pytest.approx(true_length, rel=0.06)
     assert path_length(smoothed) > 0.98 * true_length  # noise lengthens a path
-    off, _ = walk(steps, configure_klt(zero_motion=False))
-    assert sum(r.n_links for r in results) == sum(r.n_links for r in off)
-
-
-def registration_with(flow_px: float | None) -> RelativePose:
-    return RelativePose(T_reference_current=np.eye(4), covariance=np.eye(6), flow_px=flow_px)
-
-
-@pytest.mark.parametrize(
-    ("changes", "is_still"),
-    [
-        ({}, True),
-        ({"registration": registration_with(flow_px=1.5)}, False),
-        ({"registration": registration_with(flow_px=None)}, False),
-        ({"registration": None}, False),
-        ({"covariance": 1e-9 * np.eye(6)}, False),
-    ],
-)
-def test_standstill_is_no_flow_nor_motion(changes: dict[str, Any], is_still: bool) -> None:
-    estimate = Estimate(stamp_ns=7, T_world_frame=np.eye(4), covariance=np.eye(6))
-    step = RawStep(
-        estimate=estimate,
-        reference_ns=3,
-        T_reference_frame=se3.exp(np.full(6, 1e-3)),
-        covariance=1e-6 * np.eye(6),
-        registration=registration_with(flow_px=0.2),
-    )
-    config = WindowConfig(zero_motion=True, zero_motion_sigma_factor=0.5)
-    edge = zero_motion_edge(replace(step, **changes), config)
-    assert (edge is not None) == is_still
-    if edge is not None:
-        assert edge.reference_id == 3
-        np.testing.assert_array_equal(edge.T_reference_frame, np.eye(4))
-        np.testing.assert_allclose(edge.covariance, 0.25e-6 * np.eye(6))
-    assert zero_motion_edge(step, WindowConfig(zero_motion=False)) is None

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from gvo.config import Config
 from gvo.errors import SmoothingError
+from gvo.frontend.calibration import OFFSET_SIGMA_PX
 from gvo.frontend.descriptor import DescriptorFrontend
 from gvo.frontend.klt import KltFrontend
 from gvo.io.frames import frames
@@ -59,7 +60,7 @@ def fingerprint(results: Sequence[FrameResult], last: Sequence[Estimate]) -> lis
 @pytest.mark.parametrize("kind", ["klt", "descriptor"])
 def test_an_equal_configuration_and_one_taken_back_change_no_bit(sensor: Sensor, kind: str) -> None:
     config = change(Config(), frontend={"kind": kind})
-    other = change(config, klt={"n_corners": 60}, stereo={"sigma_px": 1.0}, window={"size": 2})
+    other = change(config, klt={"n_corners": 60}, stereo={"max_depth_m": 60.0}, window={"size": 2})
     untouched, meddled = odometry_of(sensor, config), odometry_of(sensor, config)
     expected = [untouched.track(frame) for frame in recorded(sensor)]
     results = []
@@ -146,7 +147,7 @@ def test_keyframes_of_other_descriptors_are_released() -> None:
 
 @pytest.mark.parametrize("kind", ["klt", "descriptor"])
 @pytest.mark.parametrize(
-    "section", [{"stereo": {"patch_radius_px": 4}}, {"camera": {"readout_ms": 9.0}}]
+    "section", [{"stereo": {"max_depth_m": 90.0}}, {"camera": {"readout_ms": 9.0}}]
 )
 def test_what_is_learnt_stays_until_its_sections_change(kind: str, section: dict[str, Any]) -> None:
     config = change(Config(), frontend={"kind": kind})
@@ -164,7 +165,7 @@ def test_what_is_learnt_stays_until_its_sections_change(kind: str, section: dict
     odometry.track(recorded("stereo")[5])
     renewed = odometry.rig_offsets
     assert renewed is not None
-    assert renewed.disparity.sigma == config.stereo.offset_sigma_px
+    assert renewed.disparity.sigma == OFFSET_SIGMA_PX
     assert renewed.readout.value == pytest.approx(0.009 if "camera" in section else 0.0)
 
 
@@ -172,7 +173,7 @@ def test_what_an_rgbd_camera_taught_outlasts_a_change_of_stereo() -> None:
     odometry = odometry_of("rgbd")
     odometry.track(recorded("rgbd")[0])
     learnt = odometry.rig_offsets
-    odometry.reconfigure(change(Config(), stereo={"sigma_px": 0.4}))
+    odometry.reconfigure(change(Config(), stereo={"max_depth_m": 90.0}))
     odometry.track(recorded("rgbd")[1])
     assert odometry.rig_offsets is learnt
 

@@ -298,7 +298,7 @@ def _check_corners(frames: Sequence[RgbdFrame], config: Config) -> Finding:
     """Count the corners that odometry can use: depth known, in range, away from steps."""
     counts = []
     for frame in frames:
-        corners = detect_corners(frame.image, config.klt)
+        corners = detect_corners(frame.image, config.klt.n_corners)
         counts.append(int(np.count_nonzero(sample_depth(frame.depth, corners, config.depth)[1])))
     return measured(
         "depth: corners with depth",

@@ -206,19 +206,20 @@ def _check_texture(
     name: str, images: Sequence[ImageArray], pairs: Sequence[tuple[ImageArray, ...]], config: Config
 ) -> Iterator[Finding]:
     check = config.check
-    counts = [len(detect_corners(image, config.klt)) for image in images]
+    counts = [len(detect_corners(image, config.klt.n_corners)) for image in images]
     yield measured(
         f"{name}: corners",
         float(np.median(counts)),
         Limits(low=check.min_corners, fault_low=config.ransac.min_inliers),
         text=f"{np.median(counts):.0f} median, {min(counts)} least of {config.klt.n_corners}",
-        fix="more light, texture or contrast in view; klt.min_eigenvalue takes weaker corners",
+        fix="more light, texture or contrast in view",
     )
     if not pairs:
         yield unknown(f"{name}: corners found again", "no two consecutive frames")
         return
     shares = [
-        followed_share(first, second, detect_corners(first, config.klt)) for first, second in pairs
+        followed_share(first, second, detect_corners(first, config.klt.n_corners))
+        for first, second in pairs
     ]
     yield measured(
         f"{name}: corners found again",

@@ -14,7 +14,7 @@ from gvo.diagnostics.check.findings import Finding, Limits, lost, measured, unkn
 from gvo.diagnostics.check.sampling import Sample, StreamStamps, Survey
 from gvo.errors import GvoError
 from gvo.frontend.klt import image_of
-from gvo.frontend.tracking import detect_corners, track_pixels
+from gvo.frontend.tracking import N_WIDE_LEVELS, detect_corners, track_pixels
 from gvo.io.frames import frames, pair_limit_key
 from gvo.io.recording import ChosenImages, RecordingInfo, Source, StampedImage
 from gvo.odometry.odometry import Odometry
@@ -299,10 +299,10 @@ def _flow_px(sample: Sample, config: Config) -> float:
     first, second = sample.first, sample.second
     if second is None or isinstance(first, FaultyFrame) or isinstance(second, FaultyFrame):
         return 0.0
-    images, klt = (image_of(first), image_of(second)), config.klt
-    corners = detect_corners(images[0], klt)
+    images = image_of(first), image_of(second)
+    corners = detect_corners(images[0], config.klt.n_corners)
     ends, is_tracked = track_pixels(
-        images, corners, corners, klt, n_levels=klt.n_wide_levels, is_checked=True
+        images, corners, corners, n_levels=N_WIDE_LEVELS, is_checked=True
     )
     lengths = np.linalg.norm(ends - corners, axis=1)[is_tracked]
     return float(np.median(lengths)) if len(lengths) >= config.ransac.min_inliers else 0.0

@@ -85,7 +85,7 @@ class _Drive:
         runtime = config.runtime.model_copy(update={"threads": 1})
         watchable = config.model_copy(update={"runtime": runtime})
         self._odometry = Odometry(source.info.camera, watchable)
-        self._camera = as_stereo(source.info.camera, config)
+        self._camera = as_stereo(source.info.camera)
         self._name, self._config = source.info.name, config
         self._frames: dict[int, Frame] = {}
         self._indices: dict[int, int] = {}
@@ -145,7 +145,7 @@ class _Drive:
         """Tell what each earlier frame contributed."""
         registrations = {each.reference_ns: each.result for each in tried}
         keyframes = {link.reference_ns: link for link in result.links if link.kind == "keyframe"}
-        before = [link for link in result.links if link.kind in ("step", "standstill")]
+        before = [link for link in result.links if link.kind == "step"]
         others = sorted({*scores} - {link.reference_ns for link in before} | {*registrations})
         refusals = {each.reference_id: each.reason for each in reversed(result.causal.rejected)}
         for ns, link, registration in [

@@ -19,6 +19,7 @@ from gvo.frontend.registration import search_consensus
 from gvo.frontend.rgbd import sample_depth
 from gvo.frontend.stereo.corners import N_SEARCH_STEPS
 from gvo.frontend.stereo.disparity import follow_disparities
+from gvo.frontend.stereo.patches import PATCH_RADIUS_PX, SEARCH_RADIUS_PX
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
@@ -170,7 +171,7 @@ def explain_subpixel(
     """Follow the match of the median horizontal gradient; None if none was kept, and for RGB-D."""
     if not isinstance(frame, StereoFrame) or not stereo.are_kept.any():
         return None
-    radius, searched = config.patch_radius_px, trace.find("corners.searched")
+    radius, searched = PATCH_RADIUS_PX, trace.find("corners.searched")
     chosen = _choose(frame.left, stereo, radius)
     pixel, disparity = stereo.pixels[chosen], float(stereo.values[chosen])
     if searched:
@@ -185,7 +186,7 @@ def explain_subpixel(
         # Patches are those of whole pixels, and so are the columns.
         method, pixel = "parabola", np.rint(pixel)
         start = float(pixel[0] - np.rint(_partner(trace.find("descriptor.stereo"), chosen)[0]))
-        iterates, reach = np.array([start, disparity]), config.search_radius_px
+        iterates, reach = np.array([start, disparity]), SEARCH_RADIUS_PX
         columns = start + np.arange(-reach, reach + 1, dtype=np.float64)
     u, v = pixel
     left = _patch(frame.left, u, v, radius)

@@ -14,6 +14,8 @@ from gvo.config import StereoConfig
 from gvo.frontend.stereo.disparity import MAX_STEP_PX, Strips, fit_slopes, have_room
 from gvo.frontend.stereo.matching import parabola_vertex
 from gvo.frontend.stereo.patches import (
+    PATCH_RADIUS_PX,
+    SEARCH_RADIUS_PX,
     Likeness,
     Patches,
     correlate_rows,
@@ -91,7 +93,7 @@ def measure_corners(
     corners : ndarray of float64, shape (n, 2)
         Whole pixels in the left image.
     config : StereoConfig
-        Size of the patches, how far to search on either side, sub-pixel steps or none.
+        Sub-pixel steps or none.
     max_disparity : float
         Pixels.
     row_offset_px : float
@@ -102,7 +104,7 @@ def measure_corners(
     CornerDisparities
     """
     rough, is_found, rivals = search_disparities(halves, corners, max_disparity)
-    shape, radius = images[0].shape, config.patch_radius_px
+    shape, radius = images[0].shape, PATCH_RADIUS_PX
     placed = np.flatnonzero(is_found & have_room(shape, corners, rough, radius))
     have_rival = [have_room(shape, corners[placed], column, radius) for column in rivals[placed].T]
     ranks, doubtful = np.nonzero(have_rival)
@@ -161,7 +163,7 @@ def _search_strips(
     Returns the disparities, the patches of the right image there, and which searches converged.
     """
     left, right_image = images
-    radius, reach_px = config.patch_radius_px, config.search_radius_px
+    radius, reach_px = PATCH_RADIUS_PX, SEARCH_RADIUS_PX
     u, v = pixels[owners].T
     strips = Strips.cut(
         right_image, u, v + row_offset_px, starts, radius_px=radius, reach_px=reach_px

@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 
 from gvo.config import StereoConfig
 from gvo.frontend.stereo.matching import parabola_minimum
-from gvo.frontend.stereo.patches import Patches, SlantedPatches, sample_patches, squared_differences
+from gvo.frontend.stereo.patches import (
+    PATCH_RADIUS_PX,
+    SEARCH_RADIUS_PX,
+    Patches,
+    SlantedPatches,
+    sample_patches,
+    squared_differences,
+)
 from gvo.types import BoolArray, FloatArray, ImageArray
 
 # Gauss-Newton steps after the parabola: the last moves by less than 0.01 pixels.
@@ -240,7 +247,7 @@ def _measure(
     slopes: FloatArray | None = None,
 ) -> tuple[FloatArray, BoolArray]:
     """Search for left patches, one column wider on either side, in strips of the right image."""
-    radius = config.patch_radius_px
+    radius = PATCH_RADIUS_PX
     disparities = np.full(len(pixels), np.nan)
     is_valid = have_room(images[0].shape, pixels, predicted, radius)
     chosen = np.flatnonzero(is_valid)
@@ -254,7 +261,7 @@ def _measure(
             rows,
             starts,
             radius_px=radius,
-            reach_px=config.search_radius_px,
+            reach_px=SEARCH_RADIUS_PX,
             slopes=None if slopes is None else slopes[chosen],
         )
         disparities[chosen], is_valid[chosen] = search(wide, strips)

@@ -12,6 +12,10 @@ from numpy.typing import NDArray
 
 from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 
+# Half size of the patches that are compared between left and right, and how many columns are
+# searched on either side of a start.
+PATCH_RADIUS_PX = 5
+SEARCH_RADIUS_PX = 3
 # Lower bound of the gradient energy of a patch, grey values squared: the noise.
 _MIN_ENERGY = 50.0
 # Variance of grey values over that of a disparity, its slopes and a difference of sharpness: the

@@ -63,7 +63,7 @@ class EdgeTable:
     stamps_ns, reference_ns : ndarray of int64, shape (m,)
         Stamps of the two frames, nanoseconds.
     kinds : ndarray of str, shape (m,)
-        "step", "keyframe", "depth" or "standstill".
+        "step", "keyframe" or "depth".
     is_accepted : ndarray of bool, shape (m,)
     chi2 : ndarray of float64, shape (m,)
         NaN where it is not known.

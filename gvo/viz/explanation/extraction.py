@@ -9,6 +9,7 @@ from matplotlib.patches import Patch
 
 from gvo.config import Config
 from gvo.diagnostics.explain.values import FrameExplanation, Sorting, Step
+from gvo.frontend.tracking import CELL_SIZE_PX, SPACING_PX
 from gvo.types import FloatArray, IntArray, RgbdFrame, StereoFrame
 from gvo.viz.explanation.sheet import (
     AFTER,
@@ -39,7 +40,7 @@ _IMAGE_PX = 1260.0
 def budget_of(config: Config) -> tuple[int, int]:
     """Return the number of keypoints kept at most, and the size of the cells that share it."""
     if config.frontend.kind == "klt":
-        return config.klt.n_corners, config.klt.cell_size_px
+        return config.klt.n_corners, CELL_SIZE_PX
     return config.features.n_features, config.features.cell_size_px
 
 
@@ -50,7 +51,7 @@ def draw_keypoints(explanation: FrameExplanation) -> Picture:
     detected = _per_cell(keypoints.pixels, size, image.shape)
     kept = _per_cell(keypoints.pixels[keypoints.are_kept], size, image.shape)
     is_klt = explanation.config.frontend.kind == "klt"
-    spacing = f"; the strongest of each {explanation.config.klt.min_distance_px} px"
+    spacing = f"; the strongest of each {SPACING_PX} px"
     caption = (
         f"{len(keypoints)} keypoints detected (grey{spacing if is_klt else ''}), {kept.sum()} kept "
         f"(blue), of a budget of {budget}. They are kept in rounds, the strongest of each cell of "

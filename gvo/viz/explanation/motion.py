@@ -406,7 +406,7 @@ def draw_links(explanation: FrameExplanation) -> Picture:
     """Draw the earlier frames with what each contributed."""
     if not explanation.links:
         return Picture(name="09_links", caption="None: there is no earlier frame to link to.")
-    shown = [link for link in explanation.links if link.kind not in ("standstill", "depth")]
+    shown = [link for link in explanation.links if link.kind != "depth"]
     n_columns = min(_N_COLUMNS, max(len(shown), 3))
     n_rows = -(-len(shown) // n_columns)
     rows, columns = explanation.image.shape
@@ -454,10 +454,8 @@ def _links_caption(explanation: FrameExplanation) -> str:
         "of freedom: about 6 or less where the stated covariances are right or cautious."
     )
     for link in links:
-        if link.kind == "standstill":
-            text += f"\nStandstill: an edge without motion to frame {link.frame} was added."
-        elif link.kind == "depth" and link.is_accepted:
-            text += f"\nDepth alone gave another edge to frame {link.frame} (depth.icp)."
+        if link.kind == "depth" and link.is_accepted:
+            text += f"\nDepth alone gave another edge to frame {link.frame}."
         elif link.reason and link.kind != "not linked":
             text += f"\nFrame {link.frame}: {link.reason}."
     return text

@@ -47,8 +47,8 @@ _N_RIBBON = 400  # columns of the ribbon: a single frame must be visible
 _UNKNOWN = "#999999"
 _FLOOR = 1e-3  # of the logarithmic axis
 _N_DOT_COLUMNS, _N_DOT_ROWS = 300, 60  # cells for dots
-_MARKERS = {"step": "o", "keyframe": "s", "depth": "^", "standstill": "D"}
-_HATCHES = {"step": "", "keyframe": "////", "depth": "\\\\\\\\", "standstill": "...."}
+_MARKERS = {"step": "o", "keyframe": "s", "depth": "^"}
+_HATCHES = {"step": "", "keyframe": "////", "depth": "\\\\\\\\"}
 _DECADES = (-3.0, 3.0)  # of the histogram: powers of ten
 _N_BINS = 60
 

@@ -17,7 +17,7 @@ from gvo.frontend.tracking import halve
 from gvo.types import FloatArray, ImageArray
 from tests.frontend.analytic import SHAPE, grid, image, slanted_pair
 
-CONFIG = StereoConfig(patch_radius_px=5)
+CONFIG = StereoConfig()
 
 
 def measure(
@@ -70,7 +70,7 @@ def test_what_is_less_sharp_on_the_right_is_not_taken_for_slanted() -> None:
 
 
 def test_whole_disparities_are_whole() -> None:
-    config = StereoConfig(patch_radius_px=5, subpixel="none")
+    config = StereoConfig(subpixel="none")
     found = measure((image(), image(-7.3)), config=config)
     np.testing.assert_array_equal(np.unique(found.disparities[found.are_reliable]), [7.0])
 

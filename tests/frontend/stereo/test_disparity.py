@@ -11,7 +11,7 @@ from gvo.frontend.stereo.disparity import follow_disparities, measure_disparitie
 from gvo.types import FloatArray, ImageArray
 from tests.frontend.analytic import MIDDLE, SHAPE, grid, image, slanted_pair
 
-CONFIG = StereoConfig(patch_radius_px=5)
+CONFIG = StereoConfig()
 
 
 def pair(disparity: FloatArray | float, **right: float) -> tuple[ImageArray, ImageArray]:
@@ -58,10 +58,9 @@ def test_the_disparity_is_that_of_the_very_pixel(fraction: float) -> None:
 
 def test_a_best_step_at_the_end_of_the_search_is_no_answer() -> None:
     predicted = np.full(len(grid()), 2.0)
-    near = CONFIG.model_copy(update={"search_radius_px": 2})
-    _, is_valid = measure_disparities(pair(12.0), grid(), predicted, near)
+    _, is_valid = measure_disparities(pair(12.0), grid(), predicted, CONFIG)
     assert is_valid.mean() < 0.5
-    _, is_valid = measure_disparities(pair(12.0), grid(), predicted + 9.0, near)
+    _, is_valid = measure_disparities(pair(12.0), grid(), predicted + 9.0, CONFIG)
     assert is_valid.mean() > 0.9
 
 

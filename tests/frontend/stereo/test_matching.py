@@ -27,8 +27,6 @@ SETTINGS = StereoConfig(
     row_tolerance_px=1.5,
     max_distance=0.3,
     subpixel="parabola",
-    patch_radius_px=5,
-    search_radius_px=3,
 )
 
 

@@ -69,9 +69,9 @@ def test_controls_that_nobody_touched_change_nothing(desk: Desk) -> None:
     ("section", "key", "value"),
     [
         ("klt", "n_corners", 300),
-        ("klt", "min_eigenvalue", 3e-5),
+        ("ransac", "min_disparity_px", 3e-5),
         ("window", "kernel", "cauchy"),
-        ("window", "zero_motion", True),
+        ("stereo", "estimate_offset", False),
         ("window", "min_overlap", 0.45),
         ("window", "size", 9),
     ],
@@ -189,7 +189,7 @@ def test_hints_hold_meaning_unit_and_default() -> None:
 
 def test_optional_numbers_start_from_a_value_that_is_taken() -> None:
     optional = [parameter for parameter in PARAMETERS if parameter.is_optional]
-    assert {parameter.key for parameter in optional} >= {"size", "gate", "kernel_threshold"}
+    assert {parameter.key for parameter in optional} >= {"size", "gate"}
     for parameter in optional:
         values = Config().model_dump()
         values[parameter.section][parameter.key] = parameter.start
@@ -198,16 +198,16 @@ def test_optional_numbers_start_from_a_value_that_is_taken() -> None:
 
 @settings(max_examples=20)
 @given(
-    min_eigenvalue=st.floats(1e-12, 1e3),
+    min_disparity_px=st.floats(1e-12, 1e3),
     size=st.none() | st.integers(2, 1000),
     kernel=st.sampled_from(["none", "huber", "dcs"]),
     upright=st.booleans(),
 )
 def test_values_come_back_as_the_same_configuration(
-    min_eigenvalue: float, size: Any, kernel: str, upright: bool
+    min_disparity_px: float, size: Any, kernel: str, upright: bool
 ) -> None:
     values = Config().model_dump()
-    values["klt"]["min_eigenvalue"] = min_eigenvalue
+    values["ransac"]["min_disparity_px"] = min_disparity_px
     values["window"] |= {"size": size, "kernel": kernel}
     values["features"]["upright"] = upright
     assert validate_configuration(values) == Config.model_validate(values)

@@ -185,12 +185,12 @@ def test_parameters_are_set_refused_and_followed(page: Page, player: LivePlayer)
     assert "klt.n_corners=1" in page.message.content
     assert (parameters.config.klt.n_corners, corners.value) == (300, 300)
 
-    page.controls.handle("klt", "n_levels").value = 1  # not applied yet
+    page.controls.handle("window", "n_links").value = 1  # not applied yet
     parameters.set({"klt.n_corners": 250})  # by someone else
     assert corners.value == 250
-    assert page.controls.handle("klt", "n_levels").value == 1
+    assert page.controls.handle("window", "n_links").value == 1
     page.flush()
-    assert (parameters.config.klt.n_corners, parameters.config.klt.n_levels) == (250, 1)
+    assert (parameters.config.klt.n_corners, parameters.config.window.n_links) == (250, 1)
 
 
 def wall(n_frames: int) -> Held:
