@@ -115,7 +115,7 @@ class Page:
             self._overlay = gui.add_image(empty, format="jpeg", jpeg_quality=_JPEG_QUALITY)
             self.message = gui.add_html(panels.message_html(""))  # in sight, whatever is unfolded
             self.numbers = gui.add_html(panels.numbers_html({"frame": "the first is coming"}))
-            hidden = {"standstill", *self._absent}
+            hidden = {*self._absent}
             gui.add_html(panels.legend_html(name for name in COLOURS if name not in hidden))
 
     def _add_main_panel(self) -> None:

@@ -40,7 +40,6 @@ _MEANINGS = {
     "step": "link to the frame before",
     "keyframe link": "link to a keyframe",
     "depth": "link by depth alone",
-    "standstill": "link without motion",
     "refused": "link that the window refused",
     "loops": "a place seen again",
     "refused loops": "a place that is none, or another one",

@@ -20,7 +20,6 @@ COLOURS = {
     "step": LINKS["step"],
     "keyframe link": LINKS["keyframe"],
     "depth": LINKS["depth"],
-    "standstill": LINKS["standstill"],
     "refused": REFUSED,
     **{name: style.color for name, style in LOOP_STYLES.items()},
     "ellipsoids": OTHERS[3],
@@ -31,7 +30,7 @@ _PATH_CHUNK = 256
 _CLOUD_CHUNK = 8192
 Up = Literal["-y", "+z"]
 _LINES = {
-    **dict.fromkeys(("step", "keyframe link", "depth", "standstill", "refused"), "links"),
+    **dict.fromkeys(("step", "keyframe link", "depth", "refused"), "links"),
     **dict.fromkeys(("loops", "refused loops"), "loops"),
 }
 """Kinds of lines between poses."""
