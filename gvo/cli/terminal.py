@@ -68,10 +68,7 @@ class Command(TyperCommand):
 
 @contextmanager
 def chatter_counted() -> Iterator[None]:
-    """Take what libraries write to standard error past Python, and say how much it was.
-
-    It goes into a pipe, which holds some hundred lines; what comes later is dropped.
-    """
+    """Take what libraries write to standard error past Python, and say how much it was."""
     own = sys.stderr
     try:
         number = own.fileno()
@@ -111,17 +108,7 @@ def _tell_chatter(reader: int) -> None:
 
 
 def say(text: object, *, nl: bool = True, err: bool = False) -> None:
-    """Print what is not an error, unless --quiet was given.
-
-    Parameters
-    ----------
-    text : object
-        A line in which names may stand that a recording holds.
-    nl : bool
-        False for lines that end themselves, as of a table.
-    err : bool
-        To standard error.
-    """
+    """Print what is not an error, unless --quiet was given."""
     if _LOGGER.isEnabledFor(logging.WARNING):
         lines = [str(text)] if nl else str(text).split("\n")
         typer.echo("\n".join(map(visible, lines)), nl=nl, err=err)
@@ -160,16 +147,7 @@ def tell(result: RunResult, out: Path) -> None:
 
 
 def report_smoothed(result: RunResult, out: Path, *, is_stdout_taken: bool = False) -> NoReturn:
-    """Print the result of smoothing, and end with its exit code.
-
-    Parameters
-    ----------
-    result : RunResult
-    out : Path
-        The run folder.
-    is_stdout_taken : bool
-        Print to standard error: the answers went to standard output.
-    """
+    """Print the result of smoothing, and end with its exit code."""
     from gvo.trajectory.evaluation import format_evaluations
 
     if result.evaluations:
@@ -260,10 +238,7 @@ def status(title: str) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def _handling(receive: Callable[[list[int]], None]) -> Iterator[list[int]]:
-    """Tell a function of each signal with those before; an interrupt exits as the first one says.
-
-    The list that is yielded holds the signals so far.
-    """
+    """Call `receive` with the signals so far; an interrupt exits as the first signal says."""
     received: list[int] = []
 
     def handle(number: int, frame: object) -> None:
@@ -315,11 +290,7 @@ class _UndrawnError(KeyboardInterrupt):
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[object], None]]:
-    """Yield a function that ends the work once a signal has come; call it between frames.
-
-    So a frame is either in all files or in none. A second signal ends at once, as does the first
-    one after a call with `_WRITTEN`.
-    """
+    """Yield a function that ends the work once a signal has come; call it between frames."""
     kind = KeyboardInterrupt
 
     def receive(received: list[int]) -> None:

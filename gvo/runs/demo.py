@@ -59,15 +59,7 @@ def _drive() -> SyntheticRecording:
 
 
 def write_robot_bag(truth: Trajectory, path: Path) -> None:
-    """Write the tf of a robot that carries the left camera of a stereo bag of gvo's own.
-
-    Parameters
-    ----------
-    truth : Trajectory
-        Of the camera, from the identity.
-    path : Path
-        `.mcap`.
-    """
+    """Write the tf of a robot that carries the left camera of a stereo bag of gvo's own."""
     with TemporaryDirectory(dir=path.parent, prefix=".gvo-part-") as part:
         with BagWriter(Path(part) / path.name) as bag:
             stamps_ns = truth.stamps_ns.tolist()

@@ -54,20 +54,7 @@ class SmoothingNotes:
 
 
 class Smoother:
-    """Drives a window and writes a run folder as it goes.
-
-    Parameters
-    ----------
-    folder : RunFolder
-        Open.
-    config : Config
-    notes : SmoothingNotes, optional
-        Of the run.
-    keyframes : {"manual", "distance"}
-        As of `SlidingWindow`.
-    graph_file : GraphFile, optional
-        Gets the smoothed poses too.
-    """
+    """Drives a window and writes a run folder as it goes."""
 
     def __init__(
         self,
@@ -101,13 +88,7 @@ class Smoother:
         return self.window.add_edge(event.frame_id, event.edge)
 
     def add_pose(self, event: PoseEvent) -> Estimate:
-        """Add a pose, and write what it gave.
-
-        Raises
-        ------
-        ValueError
-            As of `SlidingWindow.add_pose`; nothing is changed.
-        """
+        """Add a pose, and write what it gave."""
         causal = self.window.add_pose(event.frame_id, event.stamp_ns, event.edges, event.prior)
         raw = self.chain.advance(causal, event.edges, event.prior)
         self.statuses[causal.status] += 1

@@ -40,21 +40,7 @@ class _Durations:
 
 @dataclass(slots=True, kw_only=True)
 class Segment:
-    """A part of a run that holds together.
-
-    Parameters
-    ----------
-    id : int
-        Counted from 0.
-    first_stamp_ns, last_stamp_ns : int
-        Of its frames, nanoseconds.
-    n_frames, n_tracked : int
-        All, and those registered to earlier ones.
-    joined_to : int or None
-        Which other one a measurement joined it to, if any.
-    joined_at_ns : int or None
-        Stamp of the frame of that measurement.
-    """
+    """A part of a run that holds together."""
 
     id: int
     first_stamp_ns: int

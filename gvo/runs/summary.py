@@ -41,19 +41,7 @@ def summarize(
     *,
     state: State = "complete",
 ) -> dict[str, Any]:
-    """Return what `summary.json` holds of a run.
-
-    Parameters
-    ----------
-    loop : RunLoop
-        After its run, or in the middle of it.
-    compared : TruthComparison or Failure
-        The errors, or the reason for none.
-    warnings : list of str
-        A line each.
-    state : {"running", "interrupted", "complete"}
-        How far the run is.
-    """
+    """Return what `summary.json` holds of a run."""
     info, frame = loop.source.info, loop.base_frame
     return {
         "gvo_version": __version__,
@@ -208,17 +196,7 @@ _NOT_YET = Failure(reason="the run has not ended")
 
 
 class RunningSummary(AbstractContextManager["RunningSummary"]):
-    """Replaces `summary.json` every few seconds, and where a run is interrupted.
-
-    Parameters
-    ----------
-    loop : RunLoop
-    folder : RunFolder
-    identity : dict
-        See `run_identity`.
-    on_progress : callable, optional
-        Called first, after each frame.
-    """
+    """Replaces `summary.json` every few seconds, and where a run is interrupted."""
 
     def __init__(
         self,
@@ -240,26 +218,14 @@ class RunningSummary(AbstractContextManager["RunningSummary"]):
             self.write("running")
 
     def write(self, state: State, *warnings: str) -> None:
-        """Write how far the run came.
-
-        Raises
-        ------
-        OutputError
-            When it cannot be written.
-        """
+        """Write how far the run came."""
         lines = [*warnings, *self._loop.statistics.warnings()]
         summary = summarize(self._loop, _NOT_YET, lines, state=state)
         self._folder.write_summary(summary | {"run": self._identity})
         self._written_s = time.monotonic()
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        """Write, where the run is interrupted, how far it came.
-
-        Raises
-        ------
-        OutputError
-            In place of the same, with the number of frames written.
-        """
+        """Write, where the run is interrupted, how far it came."""
         if not isinstance(error, GvoError | KeyboardInterrupt):
             return
         is_output = isinstance(error, OutputError)

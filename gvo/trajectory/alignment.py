@@ -182,15 +182,7 @@ def _range(trajectory: Trajectory) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Similarity:
-    """A similarity transform: p_a = scale * R_a_b @ p_b + t_a_b.
-
-    Parameters
-    ----------
-    T_a_b : ndarray of float64, shape (4, 4)
-        Rotation and translation, metres.
-    scale : float
-        Positive.
-    """
+    """A similarity transform: p_a = scale * R_a_b @ p_b + t_a_b."""
 
     T_a_b: FloatArray
     scale: float = 1.0
@@ -265,11 +257,7 @@ def _fit(points_a: FloatArray, points_b: FloatArray, *, is_scaled: bool) -> Simi
 
 
 def _best_rotation(vectors_a: FloatArray, vectors_b: FloatArray) -> FloatArray:
-    """Return the least-squares R_a_b (eq. 40); any optimum if the vectors lie on a line.
-
-    `geometry.umeyama` refuses points on a line, where the rotation about it would be noise. Here
-    only the aligned positions count, and a camera may drive straight or have two poses.
-    """
+    """Return the least-squares R_a_b (eq. 40); any optimum if the vectors lie on a line."""
     if len(vectors_a) == 1:
         return np.eye(3)
     with warnings.catch_warnings():

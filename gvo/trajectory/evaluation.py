@@ -95,16 +95,6 @@ class Evaluation:
         return float(np.sqrt(np.mean(self.errors_m**2)))
 
     @property
-    def ate_mean_m(self) -> float:
-        """Mean position error, metres."""
-        return float(np.mean(self.errors_m))
-
-    @property
-    def ate_median_m(self) -> float:
-        """Median position error, metres."""
-        return float(np.median(self.errors_m))
-
-    @property
     def ate_max_m(self) -> float:
         """Largest position error, metres."""
         return float(np.max(self.errors_m))
@@ -183,27 +173,7 @@ def evaluate(
 def relative_errors(
     reference: Trajectory, estimate: Trajectory, *, delta: int = 1
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the errors of the relative poses of all pairs (i, i + delta).
-
-    Parameters
-    ----------
-    reference, estimate : Trajectory
-        Associated: of equal length.
-    delta : int
-        Distance of the two poses, in poses.
-
-    Returns
-    -------
-    translations : ndarray of float64, shape (m,)
-        Metres.
-    rotations : ndarray of float64, shape (m,)
-        Radians; both are empty if one of the trajectories has no rotations.
-
-    References
-    ----------
-    J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012,
-    doi:10.1109/IROS.2012.6385773.
-    """
+    """Return the errors of the relative poses of all pairs (i, i + delta)."""
     if delta < 1:
         raise ValueError(f"delta must be at least 1, got {delta}")
     n_pairs = max(len(reference) - delta, 0) if _have_rotations(reference, estimate) else 0

@@ -111,7 +111,7 @@ def _with_covariances(trajectory: Trajectory, path: Path) -> Trajectory:
 
 
 def read_covariances(path: str | Path, *, is_growing: bool = False) -> tuple[IntArray, FloatArray]:
-    """Read the covariances of a run folder, or what `write_covariances` wrote.
+    """Read the covariances of a run folder.
 
     Parameters
     ----------
@@ -272,30 +272,6 @@ def write_euroc(path: str | Path, trajectory: Trajectory) -> None:
     _write_lines(path, [_EUROC_HEADER, *lines])
 
 
-def write_covariances(path: str | Path, trajectory: Trajectory) -> None:
-    """Write the covariances of a trajectory as CSV, a header and a line per pose, without loss.
-
-    Parameters
-    ----------
-    path : str or Path
-        Overwritten if it exists.
-    trajectory : Trajectory
-        With covariances.
-
-    Raises
-    ------
-    ValueError
-        If it holds none.
-    TrajectoryError
-        If the file cannot be written.
-    """
-    if trajectory.covariances is None:
-        raise ValueError("the trajectory holds no covariances")
-    values = zip(trajectory.stamps_ns, trajectory.covariances, strict=True)
-    lines = (format_covariance_line(int(stamp_ns), C) for stamp_ns, C in values)
-    _write_lines(path, [COVARIANCE_HEADER, *lines])
-
-
 def _check_rotations(trajectory: Trajectory) -> None:
     if not trajectory.has_rotations:
         raise ValueError("a file of poses cannot hold positions without rotations")
@@ -372,19 +348,7 @@ def _of_matrices(table: Table) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """The fields of one line of a file.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    number : int
-        Line number, from one.
-    fields : list of str
-        At least one.
-    header : str
-        The comments since the row before.
-    """
+    """The fields of one line of a file."""
 
     path: Path
     number: int
@@ -468,29 +432,7 @@ def read_table(
     unit_ns: int | None = None,
     limit: float = MAX_POSITION_M,
 ) -> Table:
-    """Return rows as numbers.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    rows : iterable of Row
-    columns : slice
-        Which are the values; from start to stop.
-    n_columns : int, optional
-        Required in each row.
-    unit_ns : int, optional
-        Nanoseconds of a unit of the first column, 1_000_000_000 for seconds; it is converted
-        without loss (decimal arithmetic).
-    limit : float
-        Of the absolute values.
-
-    Raises
-    ------
-    TrajectoryError
-        If a row has more or fewer columns, a number is not finite, or a stamp is no number or out
-        of range; names the line.
-    """
+    """Return rows as numbers."""
     numbers, stamps_ns, values = array("q"), array("q"), array("d")
     for row in rows:
         if n_columns not in (None, len(row.fields)):
