@@ -3,6 +3,7 @@
 The public names are loaded when they are first used, so that the command line answers at once.
 """
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING
 
@@ -56,6 +57,9 @@ if TYPE_CHECKING:
     from gvo.types import Status as Status
     from gvo.types import StereoFrame as StereoFrame
     from gvo.viz.plots import plot_trajectories as plot_trajectories
+
+# OpenCV reads it as it is imported: a damaged header must not make it allocate gigabytes.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", "100000000")
 
 _MODULES = {
     "gvo.backend.window": ("SlidingWindow",),

@@ -60,6 +60,8 @@ _FIXED: Mapping[str, Value] = {
     "stereo.patch_radius_px": 5,
     "stereo.search_radius_px": 3,
     "stereo.sigma_px": 0.3,
+    "sync.age_penalty": 0.1,
+    "sync.queue_size": 100,
     "window.kernel_threshold": None,
     "window.zero_motion": False,
     "window.zero_motion_flow_px": 1.0,
@@ -89,12 +91,6 @@ class SyncConfig(Section):
     )
     stamps: Literal["header", "recording"] = _common(
         "header", "clock of the stamps of a bag's images; recording: for drivers that set none"
-    )
-    queue_size: int = _expert(
-        100, "maximum images of a stream kept while they wait for a partner", ge=2, le=10000
-    )
-    age_penalty: float = _expert(
-        0.1, "share by which a later partner must be closer in time than an earlier one", ge=0
     )
     repeated_images: Literal["skip", "keep"] = _expert(
         "skip", "frames with the image of the one before; keep: for simulation without noise"

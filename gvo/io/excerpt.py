@@ -58,20 +58,11 @@ class Excerpt:
 
     @property
     def is_everything(self) -> bool:
-        """Tell that nothing is left out."""
+        """Whether nothing is left out."""
         return self == Excerpt()
 
     def n_expected(self, n_images: int, length_s: float | None = None) -> int:
-        """Estimate how many images of stream 0 are kept, with and without partners.
-
-        Parameters
-        ----------
-        n_images : int
-            Images of stream 0 in the whole recording.
-        length_s : float, optional
-            Of the recording, seconds. Where it is unknown, start and duration are not accounted
-            for.
-        """
+        """Estimate how many of `n_images` of stream 0 are kept; `length_s`: of the recording."""
         share = 1.0
         if length_s is not None and length_s > 0:
             rest_s = max(length_s - self.start_s, 0.0)
@@ -81,47 +72,16 @@ class Excerpt:
 
 
 def make_excerpt(start_s: float, duration_s: float | None, every: int) -> Excerpt:
-    """Return the excerpt that a user asked for.
-
-    Parameters
-    ----------
-    start_s, duration_s, every
-        As of `Excerpt`.
-
-    Raises
-    ------
-    ConfigurationError
-        Where a number is out of its range.
-    """
+    """Return the excerpt that a user asked for; refuse numbers out of range in one line."""
     with named_faults(ConfigurationError, "--start, --duration, --every", others=(ValueError,)):
         return Excerpt(start_s=start_s, duration_s=duration_s, every=every)
 
 
 def take_excerpt(items: Iterable[Paired], excerpt: Excerpt) -> Iterator[Paired]:
-    """Take a part of what `pair_images` gives.
+    """Take a part of what `pair_images` gives; refuse an excerpt that holds nothing.
 
-    The pairs are those of the whole recording; none of them is decoded here.
-
-    Parameters
-    ----------
-    items : iterable of pair of StampedImage, or FaultyFrame
-        What `pair_images` gives.
-    excerpt : Excerpt
-
-    Yields
-    ------
-    pair of StampedImage, or FaultyFrame
-        Unchanged. A faulty frame takes no place in the count of `every`: it is given where the
-        pair after it is due, and is left out with the pairs that are left out.
-
-    Raises
-    ------
-    RecordingError
-        Where the excerpt holds none of the items.
-
-    Notes
-    -----
-    It stops reading at the first pair after the end: then both streams are past it. An image
+    A faulty frame takes no place in the count of `every`: it is given where the pair after it is
+    due. Reading stops at the first pair after the end: then both streams are past it. An image
     without partner ends nothing; its stamp may be a mistake, or the other stream may be late.
     """
     if excerpt.is_everything:

@@ -32,7 +32,6 @@ _N_AHEAD = 2
 _LOAD_ERRORS = (OSError, MemoryError, ValueError, cv2.error)
 _Preparers: TypeAlias = tuple["ImagePreparer", "ImagePreparer"]
 Through: TypeAlias = Callable[[Iterator[Paired]], Iterator[Paired]]
-"""What pairs go through before they are decoded."""
 _Prepared: TypeAlias = NDArray[Any] | str
 _Jobs: TypeAlias = Sequence[tuple[Callable[[], _Prepared], Future[_Prepared] | None]]
 _Started: TypeAlias = tuple[Paired, _Jobs]
@@ -107,30 +106,7 @@ def paired(
     limit_ms: float | None = None,
     is_prompt: bool = False,
 ) -> Iterator[Paired]:
-    """Pair the images of a recording as configured, see `pair_images`.
-
-    Parameters
-    ----------
-    images : iterable of StampedImage
-        Both streams, interleaved in any way.
-    sensor : {"stereo", "rgbd"}
-        Says which limit counts.
-    sync : SyncConfig
-    limit_ms : float, optional
-        Largest difference of the stamps of a pair, in place of the configured one.
-    is_prompt : bool
-        See `pair_images`.
-
-    Yields
-    ------
-    pair of StampedImage, or FaultyFrame
-        Also for images of which the stamp alone is wrong, see `StampFilter`.
-
-    Raises
-    ------
-    RecordingError
-        When the recording cannot be read on.
-    """
+    """Pair the images of a recording as configured, or within a given limit; see `pair_images`."""
     key = pair_limit_key(sensor)
     limit = float(getattr(sync, key)) if limit_ms is None else limit_ms
     stamps = StampFilter(_readable(images))
@@ -138,8 +114,6 @@ def paired(
         stamps.images(),
         limit_ns=round(limit * 1e6),
         partner=f"{'right' if sensor == 'stereo' else 'depth'} image within sync.{key}",
-        queue_size=sync.queue_size,
-        age_penalty=sync.age_penalty,
         is_prompt=is_prompt,
     )
     for item in pairs:
@@ -149,7 +123,6 @@ def paired(
 
 
 def _readable(images: Iterable[StampedImage]) -> Iterator[StampedImage]:
-    """Yield the images; where a disk or a network fails, say so as all sources do."""
     try:
         yield from images
     except (OSError, MemoryError) as error:
@@ -212,7 +185,6 @@ def _prepare(image: StampedImage, preparer: ImagePreparer, info: RecordingInfo) 
 def _frame_of(
     sensor: Sensor, stamps_ns: tuple[int, int], first: NDArray[Any], second: NDArray[Any]
 ) -> Frame:
-    """Return the frame of two prepared images, stamped as the first one."""
     stamp_ns, depth_ns = stamps_ns
     if sensor == "stereo":
         return StereoFrame(stamp_ns=stamp_ns, left=first, right=second)
@@ -224,27 +196,10 @@ def refuse_repeats(
 ) -> Iterator[Frame | FaultyFrame]:
     """Make frames faulty whose image is, pixel by pixel, that of the frame before.
 
-    No sensor gives the same noise twice: such an image is old. Taken for a new one, it says for
-    sure that the camera stood still. Two in a row make a camera that hangs; a single one, which
-    many drivers give now and then, is let through. Depth images are not compared: some sensors
-    give depth at a lower rate than colour. Nor are images of one value, in which nothing is seen
-    anyway.
-
-    Parameters
-    ----------
-    items : iterable of StereoFrame, RgbdFrame or FaultyFrame
-    names : tuple of two str
-        Of the streams.
-
-    Yields
-    ------
-    StereoFrame, RgbdFrame or FaultyFrame
-        All of them, in their order.
-
-    Raises
-    ------
-    GvoError
-        What reading the items raises, after those read before.
+    No sensor gives the same noise twice: such an image is old, and the camera would seem to stand
+    still. Two in a row make a camera that hangs; a single one, which many drivers give now and
+    then, is let through. Depth images are not compared: some sensors give depth at a lower rate
+    than colour. Nor are images of one value, in which nothing is seen anyway.
     """
     last: Frame | None = None
     waiting: list[Frame | FaultyFrame] = []  # from the first repeat on
@@ -398,16 +353,9 @@ class Rig:
 
 
 class ImagePreparer:
-    """Prepare raw pixels of one stream for a frame: check, make grey, rectify.
+    """Prepares the raw pixels of one stream for a frame: checks, makes grey, rectifies.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        Of the stream; depth images take that of the colour camera.
-    is_depth : bool
-        The stream holds depth: rectified by the nearest pixel, so that no depth is made up.
-    depth_view : DepthView, optional
-        Of depth images that another camera sees than that of the calibration.
+    Depth is rectified by the nearest pixel, so that no depth is made up.
     """
 
     def __init__(
@@ -429,22 +377,7 @@ class ImagePreparer:
             self._fixed_maps = (np.asarray(fixed[0]), np.asarray(fixed[1]))
 
     def __call__(self, pixels: NDArray[Any]) -> NDArray[Any]:
-        """Return the image of the frame.
-
-        Parameters
-        ----------
-        pixels : ndarray
-            uint8 (h, w) or (h, w, 3) in BGR order; or depth as float32 (h, w), metres.
-
-        Returns
-        -------
-        ndarray of uint8 or float32, shape (h, w)
-
-        Raises
-        ------
-        RecordingError
-            When size or type are not what the calibration says.
-        """
+        """Return grey uint8 (h, w) of grey or BGR pixels; of metres (h, w) float32 metres."""
         _check_pixels(pixels, is_depth=self._is_depth)
         if pixels.shape[:2] != self._size:
             raise RecordingError(
@@ -473,12 +406,7 @@ class ImagePreparer:
 
 
 def _check_pixels(pixels: object, *, is_depth: bool) -> None:
-    """Refuse what would be taken for something else, such as 16 bits cut to 8.
-
-    Raises
-    ------
-    RecordingError
-    """
+    """Refuse what would be taken for something else, such as 16 bits cut to 8."""
     if not isinstance(pixels, np.ndarray):
         raise RecordingError(f"expected an array of pixels, got {type(pixels).__name__}")
     if is_depth:
@@ -492,7 +420,6 @@ def _check_pixels(pixels: object, *, is_depth: bool) -> None:
 
 
 def _is_known(depth: NDArray[Any]) -> bool:
-    """Tell whether any depth is finite and positive."""
     return bool(np.any((depth > 0) & (depth < np.inf)))
 
 
@@ -501,7 +428,6 @@ def _size_text(shape: tuple[int, ...]) -> str:
 
 
 def _error_text(error: Exception) -> str:
-    """Return what an error says on one line, with its kind where that is none of ours."""
     text = " ".join(str(error).split())
     return text if isinstance(error, GvoError) else f"{type(error).__name__}: {text}"
 

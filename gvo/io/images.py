@@ -5,12 +5,11 @@ from __future__ import annotations
 import os
 import re
 import stat
-import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -22,20 +21,19 @@ from gvo.types import DepthArray, ImageArray
 MAX_PIXELS = 100_000_000
 """More than any camera has: a damaged header must not make a decoder allocate gigabytes."""
 
-_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+# By their first bytes; OpenCV would decode other formats too, whose decoders are not bounded.
+_FORMATS = {
+    "PNG": re.compile(rb"\x89PNG\r\n\x1a\n"),
+    "JPEG": re.compile(rb"\xff\xd8\xff"),
+    "TIFF": re.compile(rb"II\*\0|MM\0\*"),
+    "BMP": re.compile(rb"BM"),
+    "PNM": re.compile(rb"P[1-6]\s"),
+}
+_N_PNG_MAGIC = 8
 _PNG_END = b"IEND"
 _N_AT_ONCE = 4096  # bytes of which zlib makes a checksum without giving Python's lock away
-_JPEG_MAGIC = b"\xff\xd8\xff"
-_TIFF_MAGICS = {b"II*\0": "<", b"MM\0*": ">"}
-_BMP_MAGIC = b"BM"
-# Without going back: comments can be split up in more ways than could ever be tried.
-_PNM_GAP = rb"(?>(?:\s+#[^\n]*+)*+\s+)"
-_PNM = re.compile(rb"P[1-6]" + _PNM_GAP + rb"(\d{1,10}+)" + _PNM_GAP + rb"(\d{1,10}+)\s")
 _JPEG_FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_BARE_MARKERS = frozenset({0x01, *range(0xD0, 0xD8)})  # no length follows
-_TIFF_SIZE_TAGS = (256, 257)
-_TIFF_FORMS = {3: "H", 4: "I"}
-_N_HEAD = 512
 _MAX_PIXELS_PER_BYTE = 2048  # twice what deflate makes of black, four times what JPEG does
 _TOO_DARK = 1 << 12
 _JPEG_QUALITY = 80  # of 100
@@ -96,48 +94,12 @@ FULL_RANGE = GreyRange()
 
 
 def read_image(path: Path, grey_range: GreyRange = FULL_RANGE) -> ImageArray:
-    """Read an image file.
-
-    Parameters
-    ----------
-    path : Path
-        PNG, JPEG, TIFF, BMP or PNM.
-    grey_range : GreyRange
-        Of 16-bit images.
-
-    Returns
-    -------
-    ndarray of uint8, shape (height, width) or (height, width, 3)
-        Grey, or colour in BGR order.
-
-    Raises
-    ------
-    RecordingError
-        When the file is missing, empty, truncated or no image, or nearly black.
-    """
+    """Return the grey (h, w) or BGR (h, w, 3) pixels, 8 bits, of a PNG, JPEG, TIFF, BMP or PNM."""
     return to_8_bit(decode_image(_read_bytes(path), str(path)), str(path), grey_range)
 
 
 def read_depth(path: Path, scale: float) -> DepthArray:
-    """Read a depth image file.
-
-    Parameters
-    ----------
-    path : Path
-        16-bit grey image.
-    scale : float
-        Counts per metre.
-
-    Returns
-    -------
-    ndarray of float32, shape (height, width)
-        Metres, NaN = unknown.
-
-    Raises
-    ------
-    RecordingError
-        When the file is missing, empty, truncated or no 16-bit grey image.
-    """
+    """Return the metres (h, w), NaN = unknown, of a 16-bit grey image of counts."""
     return depth_from_counts(decode_image(_read_bytes(path), str(path)), scale, str(path))
 
 
@@ -145,9 +107,11 @@ def _read_bytes(path: Path) -> NDArray[np.uint8]:
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
-            raise RecordingError(f"{path}: is no file")  # a device may never end
+            raise RecordingError(f"{path}: not a file")  # a device may never end
         if status.st_size > _MAX_FILE_BYTES:
-            raise RecordingError(f"{path}: no image has {status.st_size} bytes, it is damaged")
+            raise RecordingError(
+                f"{path}: {status.st_size} bytes are too many for an image, it is damaged"
+            )
         # With as few calls as can be: each hands Python's lock over to another thread.
         file = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
         try:
@@ -159,40 +123,31 @@ def _read_bytes(path: Path) -> NDArray[np.uint8]:
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
     except ValueError as error:  # a zero in a name
-        raise RecordingError(f"{str(path)!r}: is no name of a file") from error
+        raise RecordingError(f"{str(path)!r}: not a valid file name") from error
 
 
 def decode_image(data: NDArray[np.uint8], where: str) -> NDArray[Any]:
-    """Decode an image file held in memory, unchanged in depth and channels.
-
-    Parameters
-    ----------
-    data : ndarray of uint8, shape (n,)
-        The whole file.
-    where : str
-        File or topic, for the message.
-
-    Raises
-    ------
-    RecordingError
-        When it is empty, truncated, of an absurd size or no image.
-    """
+    """Decode an image file held in memory, unchanged in depth and channels."""
     if len(data) == 0:
         raise RecordingError(f"{where}: the image is empty")
-    header = read_header(data)
-    if header is None:
+    start = data[:16].tobytes()
+    kind = next((name for name, magic in _FORMATS.items() if magic.match(start)), "")
+    if not kind:
         raise RecordingError(
             f"{where}: the image cannot be decoded: expected PNG, JPEG, TIFF, BMP or PNM, but it "
-            f"begins with {data[:8].tobytes()!r}"
+            f"begins with {start[:8]!r}"
         )
-    check_size(header.width, header.height, where)
-    check_density(header, len(data), where)
-    is_complete = _COMPLETE.get(header.format)
-    if is_complete is not None and not is_complete(data):
-        raise RecordingError(f"{where}: the {header.format} image is truncated or damaged")
+    if kind == "PNG":
+        size = (
+            int.from_bytes(data[16:20].tobytes(), "big"),
+            int.from_bytes(data[20:24].tobytes(), "big"),
+        )
+        _check_file(kind, size, _is_png_complete(data), len(data), where)
+    elif kind == "JPEG":
+        _check_file(kind, _jpeg_size(data), _is_jpeg_complete(data), len(data), where)
     try:
         pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
+    except cv2.error as error:  # more than OPENCV_IO_MAX_IMAGE_PIXELS, too
         raise RecordingError(f"{where}: the image cannot be decoded") from error
     if pixels is None or pixels.size == 0:
         raise RecordingError(f"{where}: the image cannot be decoded")
@@ -200,22 +155,7 @@ def decode_image(data: NDArray[np.uint8], where: str) -> NDArray[Any]:
 
 
 def to_8_bit(pixels: NDArray[Any], where: str, grey_range: GreyRange = FULL_RANGE) -> ImageArray:
-    """Return grey (h, w) or BGR (h, w, 3) pixels of 8 bits; alpha is dropped.
-
-    Parameters
-    ----------
-    pixels : ndarray of uint8 or uint16, shape (h, w), (h, w, 3) or (h, w, 4)
-        Colour in BGR order.
-    where : str
-        File or topic, for the message.
-    grey_range : GreyRange
-        Of 16-bit images.
-
-    Raises
-    ------
-    RecordingError
-        When the values are of another type, or those of 16 bits would become nearly black.
-    """
+    """Return grey (h, w) or BGR (h, w, 3) pixels of 8 bits; alpha is dropped."""
     channels = pixels.shape[2] if pixels.ndim == 3 else 1
     if pixels.dtype not in (np.uint8, np.uint16) or channels not in (1, 3, 4):
         raise RecordingError(
@@ -242,22 +182,7 @@ def _check_brightness(largest: int, grey_range: GreyRange, where: str) -> None:
 
 
 def depth_from_counts(counts: NDArray[Any], scale: float, where: str) -> DepthArray:
-    """Return metres (h, w), NaN = unknown, of depth counts.
-
-    Parameters
-    ----------
-    counts : ndarray of uint16, shape (h, w)
-        Depth; 0 and 65535 mean unknown.
-    scale : float
-        Counts per metre.
-    where : str
-        File or topic, for the message.
-
-    Raises
-    ------
-    RecordingError
-        When the counts are no 16-bit grey image.
-    """
+    """Return metres (h, w), NaN = unknown, of 16-bit counts, of which 0 and 65535 are unknown."""
     if counts.dtype != np.uint16 or counts.ndim != 2:
         raise RecordingError(
             f"{where}: expected depth as 16-bit grey, got {counts.dtype} of shape {counts.shape}"
@@ -269,18 +194,7 @@ def depth_from_counts(counts: NDArray[Any], scale: float, where: str) -> DepthAr
 
 
 def depth_from_metres(metres: NDArray[Any]) -> DepthArray:
-    """Return depth where all that is unknown is NaN.
-
-    Parameters
-    ----------
-    metres : ndarray of float, shape (h, w)
-        Zero, negative or not finite: unknown.
-
-    Returns
-    -------
-    ndarray of float32, shape (h, w)
-        Metres, NaN = unknown; the same array where nothing has to be marked.
-    """
+    """Return metres (h, w) with NaN for what is not positive or not finite; copies if need be."""
     metres = np.asarray(metres, dtype=np.float32)
     # Both leave NaN out. Most drivers mark all that is unknown so: a look is a tenth of a copy.
     lowest, highest = np.fmin.reduce(metres, axis=None), np.fmax.reduce(metres, axis=None)
@@ -293,40 +207,13 @@ def depth_from_metres(metres: NDArray[Any]) -> DepthArray:
 
 
 def is_in_counts(depth: DepthArray, scale: float) -> bool:
-    """Tell whether depth was made of counts of this scale.
-
-    Parameters
-    ----------
-    depth : ndarray of float32, shape (h, w)
-        Metres, NaN = unknown.
-    scale : float
-        Counts per metre.
-
-    Returns
-    -------
-    bool
-        False where nothing is known, too.
-    """
+    """Tell whether metres were made of so many counts per metre; False if nothing is known."""
     counts = scale * depth[np.isfinite(depth)].astype(np.float64)
     return len(counts) > 0 and bool(np.all(np.abs(counts - np.round(counts)) < _TOLERANCE))
 
 
 def to_counts(depth: DepthArray, scale: float) -> tuple[NDArray[np.uint16], int]:
-    """Return counts, and the number of pixels that are too far for them.
-
-    Parameters
-    ----------
-    depth : ndarray of float32, shape (h, w)
-        Metres, NaN = unknown.
-    scale : float
-        Counts per metre.
-
-    Returns
-    -------
-    counts : ndarray of uint16, shape (h, w)
-        Rounded, 0 = unknown or too far.
-    n_too_far : int
-    """
+    """Return rounded counts, 0 = unknown or too far, and the number of pixels too far."""
     counts = np.round(scale * np.nan_to_num(depth, nan=0.0).astype(np.float64))
     is_far = counts > MAX_COUNT
     counts[is_far] = 0
@@ -334,15 +221,7 @@ def to_counts(depth: DepthArray, scale: float) -> tuple[NDArray[np.uint16], int]
 
 
 def exact_counts(depth: DepthArray, scale: float) -> NDArray[np.uint16] | None:
-    """Return counts from which the depth comes back bit by bit; None where there are none.
-
-    Parameters
-    ----------
-    depth : ndarray of float32, shape (h, w)
-        Metres, NaN = unknown.
-    scale : float
-        Counts per metre.
-    """
+    """Return counts from which the depth comes back bit by bit; None where there are none."""
     counts, _ = to_counts(depth, scale)
     is_exact = np.array_equal(depth_from_counts(counts, scale, "depth"), depth, equal_nan=True)
     return counts if is_exact else None
@@ -372,43 +251,6 @@ def encode_image(pixels: NDArray[Any], suffix: Literal[".png", ".tiff", ".jpg"])
     return data.tobytes()
 
 
-class ImageHeader(NamedTuple):
-    """Format by name, width and height in pixels; 0 where the header does not tell."""
-
-    format: str
-    width: int
-    height: int
-
-
-def read_header(data: NDArray[np.uint8]) -> ImageHeader | None:
-    """Read the header of an encoded image.
-
-    Parameters
-    ----------
-    data : ndarray of uint8, shape (n,)
-        The whole file.
-
-    Returns
-    -------
-    ImageHeader or None
-        Of PNG, JPEG, TIFF, BMP, PBM, PGM or PPM; None for anything else.
-    """
-    head = data[:_N_HEAD].tobytes()
-    if head.startswith(_PNG_MAGIC):
-        size = (int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big"))
-        return ImageHeader("PNG", *size)
-    if head.startswith(_JPEG_MAGIC):
-        return ImageHeader("JPEG", *_jpeg_size(data))
-    if head[:4] in _TIFF_MAGICS:
-        return ImageHeader("TIFF", *_tiff_size(data, _TIFF_MAGICS[head[:4]]))
-    if head.startswith(_BMP_MAGIC) and len(head) >= 26:
-        width, height = struct.unpack("<ii", head[18:26])
-        return ImageHeader("BMP", abs(width), abs(height))
-    if match := _PNM.match(head):
-        return ImageHeader("PNM", int(match[1]), int(match[2]))
-    return None
-
-
 def _jpeg_size(data: NDArray[np.uint8]) -> tuple[int, int]:
     position = 2
     while position + 9 <= len(data) and data[position] == 0xFF:
@@ -426,20 +268,6 @@ def _jpeg_step(segment: bytes) -> int:
     if segment[1] in _JPEG_BARE_MARKERS:
         return 2
     return 2 + int.from_bytes(segment[2:4], "big")
-
-
-def _tiff_size(data: NDArray[np.uint8], order: str) -> tuple[int, int]:
-    """Read width and height from the first directory of a TIFF."""
-    sizes = dict.fromkeys(_TIFF_SIZE_TAGS, 0)
-    (offset,) = struct.unpack(f"{order}I", data[4:8].tobytes().ljust(4, b"\0"))
-    (n_entries,) = struct.unpack(f"{order}H", data[offset : offset + 2].tobytes().ljust(2, b"\0"))
-    entries = data[offset + 2 : offset + 2 + 12 * n_entries].tobytes()
-    for start in range(0, len(entries) - 11, 12):
-        tag, type_, _ = struct.unpack_from(f"{order}HHI", entries, start)
-        # of several of one tag the first counts
-        if sizes.get(tag) == 0 and type_ in _TIFF_FORMS:
-            (sizes[tag],) = struct.unpack_from(f"{order}{_TIFF_FORMS[type_]}", entries, start + 8)
-    return sizes[256], sizes[257]
 
 
 def check_size(width: int, height: int, where: str, *, max_pixels: int = MAX_PIXELS) -> None:
@@ -463,41 +291,32 @@ def check_size(width: int, height: int, where: str, *, max_pixels: int = MAX_PIX
         raise RecordingError(f"{where}: the image claims {width}x{height} pixels, it is damaged")
 
 
-def check_density(header: ImageHeader, n_bytes: int, where: str) -> None:
-    """Refuse an image that claims more pixels than its bytes can hold.
-
-    Parameters
-    ----------
-    header : ImageHeader
-    n_bytes : int
-        Of the whole file.
-    where : str
-        File or topic, for the message.
-
-    Raises
-    ------
-    RecordingError
-        Before memory for these pixels is asked for.
-    """
-    if header.width * header.height > n_bytes * _MAX_PIXELS_PER_BYTE:
+def _check_file(
+    kind: str, size: tuple[int, int], is_complete: bool, n_bytes: int, where: str
+) -> None:
+    """Refuse a file that claims more pixels than its bytes can hold, or that has no end."""
+    check_size(*size, where)
+    if size[0] * size[1] > n_bytes * _MAX_PIXELS_PER_BYTE:
         raise RecordingError(
-            f"{where}: the image claims {header.width}x{header.height} pixels in {n_bytes} bytes, "
+            f"{where}: the image claims {size[0]}x{size[1]} pixels in {n_bytes} bytes, "
             "it is damaged"
         )
+    if not is_complete:
+        raise RecordingError(f"{where}: the {kind} image is truncated or damaged")
 
 
 def is_png(data: NDArray[np.uint8]) -> bool:
     """Tell whether data begin as a PNG does."""
-    return data[: len(_PNG_MAGIC)].tobytes() == _PNG_MAGIC
+    return _FORMATS["PNG"].match(data[:_N_PNG_MAGIC].tobytes()) is not None
 
 
-def is_jpeg_complete(data: NDArray[np.uint8]) -> bool:
+def _is_jpeg_complete(data: NDArray[np.uint8]) -> bool:
     """Tell whether a JPEG has its end; cameras fill their buffers up behind it."""
     end = b"\xff\xd9"
     return end in data[-1024:].tobytes() or end in data.tobytes().rstrip(b"\0")[-1024:]
 
 
-def is_png_complete(data: NDArray[np.uint8]) -> bool:
+def _is_png_complete(data: NDArray[np.uint8]) -> bool:
     """Tell whether the chunks of a PNG end before it does, those of its rows with their checksum.
 
     OpenCV asks for the memory of a chunk, up to gigabytes, before it sees that there is no more.
@@ -519,12 +338,9 @@ def _is_png_chunk_sound(chunk: memoryview) -> bool:
 
 def _png_chunks(data: NDArray[np.uint8]) -> Iterator[tuple[bytes, int, int]]:
     """Yield the name of each chunk, and where it and its checksum begin and end."""
-    start, name = len(_PNG_MAGIC), b""
+    start, name = _N_PNG_MAGIC, b""
     while start < len(data) and name != _PNG_END:
         head = data.data[start : start + 8].tobytes()
         name, end = head[4:], start + 12 + int.from_bytes(head[:4], "big")
         yield name, start, end
         start = end
-
-
-_COMPLETE = {"JPEG": is_jpeg_complete, "PNG": is_png_complete}

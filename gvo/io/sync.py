@@ -34,12 +34,12 @@ def pair_images(
     age_penalty: float = 0.1,
     is_prompt: bool = False,
 ) -> Iterator[Paired]:
-    """Pair the images of stream 0 with those of stream 1.
+    """Pair the images of stream 0 with those of stream 1, as message_filters of ROS does.
 
-    Without a tolerance images of equal stamps are paired, by the policy ExactTime of
-    message_filters; else by its ApproximateTime [1]_: the later one of the two images at the
-    front becomes the pivot, and gets either the last image of the other stream before it or,
-    where that is nearer by more than the age penalty, the first one after it.
+    Without a tolerance images of equal stamps are paired, by its policy ExactTime; else by its
+    ApproximateTime [1]_: the later one of the two images at the front becomes the pivot, and gets
+    either the last image of the other stream before it or, where that is nearer by more than the
+    age penalty, the first one after it.
 
     Parameters
     ----------
@@ -59,51 +59,34 @@ def pair_images(
         partner can come, not with the next image. The pairs are the same, unless a camera
         suddenly sends faster than ever before.
 
-    Returns
-    -------
-    iterator of pair of StampedImage, or FaultyFrame
+    Yields
+    ------
+    pair of StampedImage, or FaultyFrame
         One for each image of stream 0, as soon as it is certain, in the order of the stream
         (ExactTime: of the stamps waiting). Faulty with `is_unpaired` where there is no partner;
-        faulty where the stamp repeats or goes behind that of the last pair given, even if
-        message_filters pairs it: frames have increasing stamps. Images of stream 1 that nobody
-        gets are left out.
+        faulty where the stamp repeats or goes behind that of the last pair given: frames have
+        increasing stamps. Images of stream 1 that nobody gets are left out.
 
     Raises
     ------
-    ValueError
-        Where a parameter is out of its range.
     GvoError
         What reading the images raises, after the pairs of those read before.
 
     Notes
     -----
-    message_filters holds a pair back until the next image shows that it is the best. At the end
-    of the images, pairs held back are given out, as if one more image of each stream followed
-    long after.
-
-    The interval of a pair never exceeds the limit, the limits on message rates are 0 (as by
-    default in message_filters), and only two streams exist. So its search for a virtual
-    candidate never decides anything, and is not needed here.
+    At the end of the images, pairs held back are given out, as if one more image of each stream
+    followed long after. The interval of a pair never exceeds the limit, the limits on message
+    rates are 0, and only two streams exist: so the search of message_filters for a virtual
+    candidate never decides anything, and is left out.
 
     References
     ----------
     .. [1] http://wiki.ros.org/message_filters/ApproximateTime
     """
-    if limit_ns < 0 or queue_size < 1 or age_penalty < 0:
-        raise ValueError(
-            "expected limit_ns >= 0, queue_size >= 1 and age_penalty >= 0, "
-            f"got {limit_ns}, {queue_size} and {age_penalty}"
-        )
     answers = _Answers(limit_ns, partner, queue_size)
     policy: _ExactTime | _ApproximateTime = _ExactTime(queue_size, answers)
     if limit_ns > 0:
         policy = _ApproximateTime(limit_ns, queue_size, age_penalty, answers, is_prompt=is_prompt)
-    return _paired(images, policy, answers)
-
-
-def _paired(
-    images: Iterable[StampedImage], policy: _ExactTime | _ApproximateTime, answers: _Answers
-) -> Iterator[Paired]:
     try:
         for image in images:
             policy.push(image)
@@ -159,7 +142,7 @@ class _Answers:
         gaps = [abs(stamp_ns - image.stamp_ns) for stamp_ns in around]
         nearest = f"the nearest is {min(gaps) / 1e6:g} ms away" if gaps else "there is none"
         if is_crowded:
-            nearest += f", and sync.queue_size={self._queue_size} is reached"
+            nearest += f", and {self._queue_size} images wait already"
         elif gaps and min(gaps) <= self._limit_ns:
             nearest += " and belongs to another image"
         reason = f"no {self._partner}={self._limit_ns / 1e6:g}: {nearest}"
@@ -370,11 +353,6 @@ class StampFilter:
     hour late. So images after a step of more than a second wait for the next ones of their
     stream: where these go back to before the step, the stamps of those that wait are wrong. At
     most two in a row are found; where three agree, a clock was set or the recording has a gap.
-
-    Parameters
-    ----------
-    images : iterable of StampedImage
-        Both streams.
     """
 
     def __init__(self, images: Iterable[StampedImage]) -> None:
@@ -384,13 +362,7 @@ class StampFilter:
         self._faulty: list[FaultyFrame] = []
 
     def images(self) -> Iterator[StampedImage]:
-        """Yield all images but those with stray stamps.
-
-        Raises
-        ------
-        GvoError
-            What reading the images raises, after those that wait.
-        """
+        """Yield all images but those with stray stamps."""
         try:
             for image in self._images:
                 yield from self._judge(image)

@@ -14,7 +14,7 @@ from gvo.io.bag.messages import (
     decode_depth,
     decode_grey_or_color,
 )
-from gvo.io.images import GreyRange, check_density, check_size, is_jpeg_complete, read_header
+from gvo.io.images import GreyRange
 from tests.fuzz.mutations import mutate_picture
 from tests.fuzz.target import Choices, Target
 from tests.io.rvl_coder import encode_rvl
@@ -115,15 +115,6 @@ def _encoded_seeds() -> list[bytes]:
     ]
 
 
-def _header(data: bytes) -> None:
-    pixels = np.frombuffer(data, dtype=np.uint8)
-    header = read_header(pixels)
-    is_jpeg_complete(pixels)
-    if header is not None:
-        check_size(header.width, header.height, "a file")
-        check_density(header, len(data), "a file")
-
-
 def _rvl_seeds() -> list[bytes]:
     rng = np.random.default_rng(1)
     images = [rng.integers(0, 60000, (5, 7), dtype=np.uint16) for _ in range(3)]
@@ -135,7 +126,6 @@ def _rvl_seeds() -> list[bytes]:
 TARGETS = (
     Target(name="raw_images", run=_raw_image, seeds=_raw_seeds),
     Target(name="encoded_images", run=_encoded_image, seeds=_encoded_seeds, mutate=mutate_picture),
-    Target(name="image_headers", run=_header, seeds=_encoded_files),
     Target(
         name="rvl", run=lambda data: decode_rvl(np.frombuffer(data, np.uint8), ""), seeds=_rvl_seeds
     ),

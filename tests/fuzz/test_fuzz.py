@@ -67,13 +67,13 @@ def test_a_finding_is_found() -> None:
     importlib.util.find_spec("atheris") is None, reason="atheris has no wheel for this machine"
 )
 def test_the_script_counts_and_replays(tmp_path: Path) -> None:
-    ran = _fuzz("--target", "image_headers", "--runs", "300", "--findings", str(tmp_path))
+    ran = _fuzz("--target", "encoded_images", "--runs", "300", "--findings", str(tmp_path))
     assert ran.returncode == 0, ran.stderr
     executions = int(ran.stdout.splitlines()[1].split()[1])
     assert executions >= 300
     seed = tmp_path / "seed"
-    seed.write_bytes(TARGETS["image_headers"].seeds()[0])
-    replayed = _fuzz("--target", "image_headers", "--replay", str(seed))
+    seed.write_bytes(TARGETS["encoded_images"].seeds()[0])
+    replayed = _fuzz("--target", "encoded_images", "--replay", str(seed))
     assert replayed.returncode == 0, replayed.stderr
     assert "stands it" in replayed.stdout
 

@@ -36,7 +36,7 @@ from gvo.io.bag.recovery.mcap import McapScan
 from gvo.io.calibration.files import read_cameras
 from gvo.io.datasets.files import read_stamped_rows
 from gvo.io.edges.lines import parse_line, read_lines
-from gvo.io.images import MAX_PIXELS, decode_image, read_header, read_image
+from gvo.io.images import MAX_PIXELS, decode_image, read_image
 from gvo.io.poses.ground_truth import parse_truth
 from gvo.io.run_folder.reader import read_run
 from gvo.trajectory.formats import read_trajectory
@@ -194,33 +194,14 @@ def test_the_blackest_png_is_still_read() -> None:
     assert MAX_PIXELS > 4000 * 3000
 
 
-@pytest.mark.parametrize("middle", [b" #" * 250, b" #1 1 " * 60, b"\n#" * 200])
-def test_comments_of_a_pnm_take_no_time(middle: bytes) -> None:
-    assert read_header(pixels_of(b"P5" + middle + b"x")) is None
-
-
-def test_a_size_in_a_comment_is_not_that_of_the_image() -> None:
-    digits = b"0" * 12 + b"32767"
-    assert read_header(pixels_of(b"P5 # 1 1 \n" + digits + b" " + digits + b" 255 ")) is None
-
-
-def test_the_first_size_of_a_tiff_counts_as_for_its_decoder() -> None:
-    tags = [(256, 32767), (257, 32766), (256, 1), (257, 1)]
-    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags)
-    header = read_header(pixels_of(b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries))
-    assert header is not None
-    assert header[1:] == (32767, 32766)
-
-
 def test_a_jpeg_marker_without_a_length_hides_no_size() -> None:
     def frame(side: int) -> bytes:
         size = side.to_bytes(2, "big") * 2
         return b"\xff\xc0\x00\x11\x08" + size + b"\x03\x01\x22\x00\x02\x11\x01\x03\x11\x01"
 
     hidden = (b"\xff\xd8\xff\x01" + frame(32767)).ljust(4 + 0xFFC0, b"\0")
-    header = read_header(pixels_of(hidden + frame(16) + b"\xff\xd9"))
-    assert header is not None
-    assert header.width != 16
+    with pytest.raises(RecordingError, match="claims"):
+        decode_image(pixels_of(hidden + frame(16) + b"\xff\xd9"), "a topic")
 
 
 def test_floats_that_call_themselves_rgb_are_refused() -> None:

@@ -161,7 +161,7 @@ def parameters() -> dict[str, Any]:
     listed = {one["name"]: one for one in client.get_parameter_descriptions()}
     answers = [
         client.update_configuration({"window__size": 7})["window__size"],
-        client.update_configuration({"window__size": 1, "sync__queue_size": 50})["window__size"],
+        client.update_configuration({"window__size": 1, "window__n_links": 2})["window__size"],
         client.update_configuration({"camera__readout_ms": 3.5})["camera__readout_ms__null"],
         client.update_configuration({"camera__readout_ms__null": True})["camera__readout_ms__null"],
         client.update_configuration({"camera__readout_ms__null": False})["camera__readout_ms"],
