@@ -81,23 +81,7 @@ class DepthRegistration:
         self._square = np.ones((n_pixels, n_pixels), dtype=np.uint8)
 
     def __call__(self, depth: DepthArray) -> DepthArray:
-        """Return the depth in the rectified colour image.
-
-        Parameters
-        ----------
-        depth : ndarray of float32, shape (h, w)
-            As recorded: metres along the optical axis of the depth camera, NaN = unknown.
-
-        Returns
-        -------
-        ndarray of float32, shape (h_color, w_color)
-            Metres along the optical axis of the colour camera, NaN = unknown.
-
-        Raises
-        ------
-        ValueError
-            When the size is not that of the depth camera.
-        """
+        """Return metres (h, w) in the rectified colour image, NaN = unknown, of those recorded."""
         if depth.shape != self._depth_shape:
             raise ValueError(f"expected depth of shape {self._depth_shape}, got {depth.shape}")
         if self._is_done:

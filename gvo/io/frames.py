@@ -139,27 +139,23 @@ def _decoded(
 ) -> Iterator[Frame | FaultyFrame]:
     """Yield the frames of pairs, decoded ahead where there are other threads."""
     is_alone = threads == 1
+    n_ahead = 0 if is_alone else n_ahead
+    started: deque[_Started] = deque()
     with ThreadPoolExecutor(1 if threads <= 2 else 2, thread_name_prefix="decode") as pool:
-        started: deque[_Started] = deque()
-        fault: GvoError | None = None
-        while fault is None:
-            try:
-                item = next(items)
-            except StopIteration:
-                break
-            except GvoError as error:
-                fault = error  # what was read before it counts
-            else:
+        try:
+            for item in items:
                 pair = () if isinstance(item, FaultyFrame) else zip(item, preparers, strict=True)
                 jobs = [partial(_prepare, *job, info) for job in pair]
-                futures = [None if is_alone else pool.submit(job) for job in jobs]
-                started.append((item, list(zip(jobs, futures, strict=True))))
-                if len(started) > (0 if is_alone else n_ahead):
+                started.append(
+                    (item, [(job, None if is_alone else pool.submit(job)) for job in jobs])
+                )
+                if len(started) > n_ahead:
                     yield _finish(*started.popleft(), info.sensor)
-        while started:
-            yield _finish(*started.popleft(), info.sensor)
-        if fault is not None:
-            raise fault
+        except GvoError:
+            # What was read before it counts.
+            yield from (_finish(*each, info.sensor) for each in started)
+            raise
+        yield from (_finish(*each, info.sensor) for each in started)
 
 
 def _finish(item: Paired, jobs: _Jobs, sensor: Sensor) -> Frame | FaultyFrame:

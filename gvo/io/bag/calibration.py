@@ -41,23 +41,7 @@ _REMEDY = "give a topic of depth registered to colour by --depth"
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BagCalibration:
-    """What was found.
-
-    Parameters
-    ----------
-    calibrations : tuple of Calibration
-        Of left and right, or of the colour camera.
-    decisions : tuple of str
-        What was chosen, a line each.
-    depth_scale : float, optional
-        Counts per metre, where a file or the bag says so.
-    depth_view : DepthView, optional
-        Of depth that has to be registered to colour.
-    frame_id : str
-        Of the first camera in `/tf`; empty where nothing names it.
-    T_body_cam : ndarray of float64, shape (4, 4), optional
-        Maps the rectified first camera to the body that a file names, metres.
-    """
+    """The calibration of left and right, or of the colour camera, and how it was found."""
 
     calibrations: tuple[Calibration, ...]
     decisions: tuple[str, ...]
@@ -74,23 +58,6 @@ def calibrations_of_messages(
 
     A raw pair whose P hold no baseline is rectified by the transform between the cameras. Later
     messages are not read, which would take a pass over the bag: `camera_info_changes` does.
-
-    Parameters
-    ----------
-    reader : MessageReader
-        The bag; only topics of `CameraInfo` are read, and where they do not say all, transforms
-        and an image.
-    topics : CameraTopics
-        The image topics.
-    where : str
-        The bag, for messages.
-
-    Raises
-    ------
-    RecordingError
-        When the bag cannot be read.
-    CalibrationError
-        When a `CameraInfo` is missing or describes no usable camera.
     """
     first, second = read_bag_cameras(reader, topics, where)
     frame_id = first.fields.frame_id or image_frame(reader, topics.first)
@@ -106,7 +73,7 @@ def calibrations_of_messages(
     color = make_rgbd_calibration(first.fields, is_rectified=is_rectified)
     view, found = None, ""
     if second is not None:
-        view, found = choose_depth_view(reader, (first, color), second)
+        view, found = _depth_view(reader, first, color, second)
     return BagCalibration(
         calibrations=(color,),
         decisions=(*decisions, found) if found else decisions,
@@ -119,24 +86,7 @@ def calibrations_of_messages(
 def calibrations_of_file(
     paths: CalibrationPaths, topics: CameraTopics, reader: MessageReader | None = None
 ) -> BagCalibration:
-    """Read the calibration of a stereo pair, or of the colour camera, from files.
-
-    Parameters
-    ----------
-    paths : Path or sequence of Path
-        See `gvo.io.calibration.files.read_cameras`.
-    topics : CameraTopics
-        The image topics; their names say whether the images are rectified.
-    reader : MessageReader, optional
-        The bag, whose images name the camera's frame.
-
-    Raises
-    ------
-    RecordingError
-        When the bag cannot be read.
-    CalibrationError
-        When a file is malformed or describes another kind of camera.
-    """
+    """Read the calibration from files; the topics' names tell whether the images are rectified."""
     found = read_cameras(paths, sensor=topics.sensor, is_rectified=topics.first.is_rectified)
     decisions = [f"calibration: {found.origin}"]
     if topics.first.is_rectified and not found.calibrations[0].is_rectified:
@@ -164,71 +114,47 @@ def _stereo_pair(
     if has_baseline(left, right) or (left.width, left.height) != (right.width, right.height):
         baseline = stereo_baseline((left, right), where)
         return (left, right), f"baseline: {baseline:.4f} m from P of {cameras[1].info_name}"
-    found = find_extrinsics(reader, *cameras)
+    found = _find_extrinsics(reader, *cameras)
     if isinstance(found, Failure):
         raise CalibrationError(
             f"{where}: the baseline must be positive, got none from P of {cameras[1].info_name}, "
             f"nor from tf: {found.reason}; give --calibration FILE of the pair"
         )
-    origin = f"{where}: {found.origin}"
+    T_left_right, origin = found
     make_pair = pair_of_baseline if left.is_rectified else pair_of_extrinsics
-    pair = make_pair((left, right), found.T_target_source, origin)
-    baseline = stereo_baseline(pair, origin)
-    return pair, f"baseline: {baseline:.4f} m from {found.origin}"
+    pair = make_pair((left, right), T_left_right, f"{where}: {origin}")
+    baseline = stereo_baseline(pair, f"{where}: {origin}")
+    return pair, f"baseline: {baseline:.4f} m from {origin}"
 
 
-def choose_depth_view(
-    reader: MessageReader, color: tuple[BagCamera, Calibration], depth: BagCamera
+def _depth_view(
+    reader: MessageReader, camera: BagCamera, color: Calibration, depth: BagCamera
 ) -> tuple[DepthView | None, str]:
-    """Tell whether depth has to be registered to colour.
+    """Return the camera of depth that has to be registered to colour, and a line on it.
 
     It is registered already where the name of the topic says so, and where both cameras have one
-    frame, one size and the same intrinsics.
-
-    Parameters
-    ----------
-    reader : MessageReader
-        The bag; the topics of transforms are read where they are needed.
-    color : tuple of BagCamera and Calibration
-        The colour camera.
-    depth : BagCamera
-        The camera that the `CameraInfo` of the depth describes.
-
-    Returns
-    -------
-    DepthView, optional
-        Of depth that has to be registered; None where it is, or where that is not known.
-    str
-        What was found, a line; empty where there is nothing to say.
-
-    Raises
-    ------
-    RecordingError
-        When the bag cannot be read.
+    frame, one size and the same intrinsics; None where it is, or where that is not known.
     """
     if _REGISTERED.search(depth.image.base.lower()):
         return None, ""
-    camera, color_calibration = color
     try:
         calibration = make_rgbd_calibration(depth.fields, is_rectified=depth.image.is_rectified)
     except CalibrationError as error:
         return None, f"depth: taken as registered to colour: {error}"
-    difference = _difference(color_calibration, calibration)
+    difference = _difference(color, calibration)
     frames = (camera.fields.frame_id, depth.fields.frame_id)
-    if frames[0] and frames[0] == frames[1]:
-        origin = f"one frame {frames[0]}"
-        found: Extrinsics | Failure = Extrinsics(T_target_source=np.eye(4), origin=origin)
-    else:
-        found = find_extrinsics(reader, camera, depth)
+    found: tuple[FloatArray, str] | Failure = (np.eye(4), f"one frame {frames[0]}")
+    if not frames[0] or frames[0] != frames[1]:
+        found = _find_extrinsics(reader, camera, depth)
     if isinstance(found, Failure):
         return None, _advice(difference, frames, found)
-    if not difference and np.allclose(found.T_target_source, np.eye(4), atol=_SAME_PLACE_M):
+    T_color_depth, origin = found
+    if not difference and np.allclose(T_color_depth, np.eye(4), atol=_SAME_PLACE_M):
         return None, ""
-    distance = float(np.linalg.norm(found.T_target_source[:3, 3]))
-    line = f"depth: of a camera {distance:.4f} m from colour by {found.origin}, registered to it"
-    if difference:
-        line += f" ({difference})"
-    return DepthView(calibration=calibration, T_color_depth=found.T_target_source), line
+    distance = float(np.linalg.norm(T_color_depth[:3, 3]))
+    line = f"depth: of a camera {distance:.4f} m from colour by {origin}, registered to it"
+    line += f" ({difference})" if difference else ""
+    return DepthView(calibration=calibration, T_color_depth=T_color_depth), line
 
 
 def _difference(color: Calibration, depth: Calibration) -> str:
@@ -264,44 +190,13 @@ def _advice(difference: str, frames: tuple[str, str], why: Failure) -> str:
     return ""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Extrinsics:
-    """Where one camera stands as seen from another.
-
-    Parameters
-    ----------
-    T_target_source : ndarray of float64, shape (4, 4)
-        Maps coordinates of the source to the target camera, metres.
-    origin : str
-        What told it.
-    """
-
-    T_target_source: FloatArray
-    origin: str
-
-
-def find_extrinsics(
+def _find_extrinsics(
     reader: MessageReader, target: BagCamera, source: BagCamera
-) -> Extrinsics | Failure:
-    """Find the transform between two cameras of a bag.
+) -> tuple[FloatArray, str] | Failure:
+    """Find T_target_source of two cameras, metres, and what told it.
 
-    Parameters
-    ----------
-    reader : MessageReader
-        The bag; the topics of transforms are read.
-    target, source : BagCamera
-        The cameras.
-
-    Returns
-    -------
-    Extrinsics or Failure
-        By the tf between the frames that their `CameraInfo` name; where these are empty, by the
-        `tf` topics beside the streams of librealsense, which map their reference to each stream.
-
-    Raises
-    ------
-    RecordingError
-        When the bag cannot be read.
+    By the tf between the frames that their `CameraInfo` name; where these are empty, by the `tf`
+    topics beside the streams of librealsense, which map their reference to each stream.
     """
     frames = (target.fields.frame_id, source.fields.frame_id)
     if not all(frames):
@@ -311,7 +206,7 @@ def find_extrinsics(
     found = _lookup(read_tf(reader, frames=frames), frames, target.stamp_ns)
     if isinstance(found, Failure):
         return found
-    return Extrinsics(T_target_source=found, origin=f"tf {frames[0]} -> {frames[1]}")
+    return found, f"tf {frames[0]} -> {frames[1]}"
 
 
 def _lookup(buffer: TfBuffer, frames: tuple[str, str], stamp_ns: int) -> FloatArray | Failure:
@@ -329,7 +224,7 @@ def _lookup(buffer: TfBuffer, frames: tuple[str, str], stamp_ns: int) -> FloatAr
 
 def _of_realsense(
     reader: MessageReader, target: BagCamera, source: BagCamera
-) -> Extrinsics | Failure:
+) -> tuple[FloatArray, str] | Failure:
     streams = [_REALSENSE_STREAM.fullmatch(camera.image.name) for camera in (target, source)]
     references = [set() if stream is None else _references(reader, stream[1]) for stream in streams]
     common = sorted(references[0] & references[1])
@@ -340,8 +235,7 @@ def _of_realsense(
     if len(T_stream_reference) != len(set(names)):
         return Failure(reason=f"{names[0]} or {names[1]} yields no message")
     T_target_reference, T_source_reference = (T_stream_reference[name] for name in names)
-    T_target_source = T_target_reference @ se3.invert(T_source_reference)
-    return Extrinsics(T_target_source=T_target_source, origin=" and ".join(names))
+    return T_target_reference @ se3.invert(T_source_reference), " and ".join(names)
 
 
 def _references(reader: MessageReader, stream: str) -> set[str]:

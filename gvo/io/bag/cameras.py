@@ -44,21 +44,7 @@ _REALSENSE_DEPTH = re.compile(r"(/device_\d+/sensor_\d+)/[^/]+/image/data")
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BagCamera:
-    """A camera of a bag and what its first `CameraInfo` says.
-
-    Parameters
-    ----------
-    image : Topic
-        Its images.
-    info_name : str
-        Its topic of `CameraInfo`.
-    fields : CameraFields
-        Of the first message.
-    stamp_ns : int
-        Of the first message, nanoseconds.
-    notes : tuple of str
-        What was assumed, a line each.
-    """
+    """A camera of a bag and what its first `CameraInfo` says."""
 
     image: Topic
     info_name: str
@@ -70,28 +56,10 @@ class BagCamera:
 def read_bag_cameras(
     reader: MessageReader, topics: CameraTopics, where: str
 ) -> tuple[BagCamera, BagCamera | None]:
-    """Read the first `CameraInfo` of both image topics.
-
-    Parameters
-    ----------
-    reader : MessageReader
-        The bag.
-    topics : CameraTopics
-        The image topics.
-    where : str
-        The bag, for messages.
-
-    Returns
-    -------
-    first : BagCamera
-        Left or colour.
-    second : BagCamera or None
-        Right or depth; None where depth has no `CameraInfo`.
+    """Read the first `CameraInfo` of both image topics; None where depth has none.
 
     Raises
     ------
-    RecordingError
-        When the bag cannot be read.
     CalibrationError
         When a `CameraInfo` is missing.
     """
@@ -114,13 +82,7 @@ def read_bag_cameras(
 
 
 class CameraInfoWatch:
-    """Counts the `CameraInfo` that differ from the first of their topic, which is the one used.
-
-    Attributes
-    ----------
-    counts : dict of str to int
-        By topic, for those topics that have any.
-    """
+    """Counts the `CameraInfo` that differ from the first of their topic, which is the one used."""
 
     def __init__(self) -> None:
         self.counts: dict[str, int] = {}
@@ -156,12 +118,6 @@ def find_contradiction(reader: BagReader, *, by_camera_info: bool) -> str:
     Of those with images of the same topics one must follow the other, with the same `CameraInfo`.
     Files that were found in a folder, not given together, must also hold the same image topics
     and follow without a gap. A bag that a run wrote is none of a recording.
-
-    Parameters
-    ----------
-    reader : BagReader
-    by_camera_info : bool
-        Compare the `CameraInfo`, the first of each file.
     """
     parts = [(file, _image_names(file)) for file in reader.loose_files]
     for file, _ in parts:
@@ -187,7 +143,6 @@ def _image_names(file: BagFile) -> set[str]:
 
 
 def _other_camera(reader: BagReader, files: Sequence[BagFile]) -> str:
-    """Say which file begins with another `CameraInfo` than one before; empty where none does."""
     watch = CameraInfoWatch()
     names = {topic.name for topic in reader.topics if topic.type == CAMERA_INFO_TYPE}
     for file in files:
@@ -199,7 +154,7 @@ def _other_camera(reader: BagReader, files: Sequence[BagFile]) -> str:
 
 
 def image_frame(reader: MessageReader, image: Topic) -> str:
-    """Return the frame that the first image of a topic names; empty where none does."""
+    """Return the frame that the first image of a topic names; empty if none."""
     message = _first_messages(reader, {image.name}).get(image.name)
     return "" if message is None else bare(str(message.header.frame_id))
 

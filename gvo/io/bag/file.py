@@ -72,10 +72,6 @@ DAMAGE: tuple[type[Exception], ...] = (DamageError, *FAULTS)
 class BagFile:
     """A `.bag`, `.mcap` or `.db3` file.
 
-    Parameters
-    ----------
-    path : Path
-
     Attributes
     ----------
     counts : dict of Channel to int

@@ -90,13 +90,7 @@ DEPTHS = {"16UC1": Encoding("u2", 1), "mono16": Encoding("u2", 1), "32FC1": Enco
 
 
 def find_encoding(name: str, encodings: dict[str, Encoding], where: str) -> Encoding:
-    """Look an encoding up by its name.
-
-    Raises
-    ------
-    RecordingError
-        When it is none of these.
-    """
+    """Look an encoding up by its name; raise `RecordingError` when it is none of these."""
     if name not in encodings:
         raise RecordingError(
             f"{where}: encoding {shortened(name)} is not supported, expected one of "
@@ -107,15 +101,6 @@ def find_encoding(name: str, encodings: dict[str, Encoding], where: str) -> Enco
 
 def stored_pixels(image: RawImage, encoding: Encoding, where: str) -> NDArray[Any]:
     """Return the values of an image as stored, without the padding of its rows.
-
-    Parameters
-    ----------
-    image : sensor_msgs/Image
-        Of this encoding.
-    encoding : Encoding
-        By its name.
-    where : str
-        The topic, for messages.
 
     Returns
     -------
@@ -150,22 +135,7 @@ def stored_pixels(image: RawImage, encoding: Encoding, where: str) -> NDArray[An
 
 
 def convert_to_bgr(pixels: NDArray[Any], to_bgr: int, what: str) -> NDArray[Any]:
-    """Convert stored pixels to BGR.
-
-    Parameters
-    ----------
-    pixels : ndarray
-        As stored.
-    to_bgr : int
-        Code for `cv2.cvtColor`.
-    what : str
-        Topic, size and encoding, for the message.
-
-    Raises
-    ------
-    RecordingError
-        When the size is impossible, such as an odd width where pixels share their colour.
-    """
+    """Convert stored pixels to BGR by a code of `cv2.cvtColor`; refuse an impossible size."""
     try:
         return np.asarray(cv2.cvtColor(pixels, to_bgr))
     except cv2.error as error:
@@ -174,14 +144,7 @@ def convert_to_bgr(pixels: NDArray[Any], to_bgr: int, what: str) -> NDArray[Any]
 
 
 def decode_rvl(data: NDArray[np.uint8], where: str) -> NDArray[np.uint16]:
-    """Decode an RVL image with its size before it.
-
-    Parameters
-    ----------
-    data : ndarray of uint8, shape (n,)
-        Width and height as 32-bit integers, then the code.
-    where : str
-        The topic, for the message.
+    """Decode an RVL image: width and height as 32-bit integers, then the code.
 
     Returns
     -------

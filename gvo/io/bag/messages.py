@@ -43,30 +43,14 @@ _COMPRESSED_DEPTH_HEADER = struct.Struct("<iff")
 
 
 def stamp_of(header: ros.std_msgs__msg__Header) -> int:
-    """Return the stamp of a header in nanoseconds.
-
-    Parameters
-    ----------
-    header : std_msgs/Header
-        Of ROS 1 or ROS 2.
-    """
+    """Return the stamp of a header of ROS 1 or ROS 2 in nanoseconds."""
     return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
 
 
 def transform_of(translation: Any, rotation: Any) -> FloatArray | Failure:  # noqa: ANN401
-    """Return the matrix of a transform or pose, shape (4, 4).
+    """Return T, shape (4, 4), of a translation in metres and a quaternion of length one.
 
-    Parameters
-    ----------
-    translation : geometry_msgs/Vector3 or geometry_msgs/Point
-        Metres.
-    rotation : geometry_msgs/Quaternion
-        Of length one, up to a hundredth.
-
-    Returns
-    -------
-    ndarray of float64, shape (4, 4), or Failure
-        The failure says what is wrong with the numbers.
+    The length may be off by a hundredth. The failure says what is wrong with the numbers.
     """
     t = np.array([getattr(translation, axis) for axis in "xyz"], dtype=np.float64)
     quaternion_xyzw = np.array([getattr(rotation, axis) for axis in "xyzw"])
@@ -213,20 +197,7 @@ def decode_compressed_depth(
 
 
 def camera_fields(message: Any, where: str) -> CameraFields:  # noqa: ANN401 - ROS 1 or 2
-    """Return the fields of a `CameraInfo` message.
-
-    Parameters
-    ----------
-    message : sensor_msgs/CameraInfo
-        With D, K, R, P of ROS 1, or d, k, r, p of ROS 2.
-    where : str
-        Bag and topic, for messages.
-
-    Returns
-    -------
-    CameraFields
-        As they stand there, not checked.
-    """
+    """Return the fields of a `CameraInfo` of ROS 1 (`K`) or ROS 2 (`k`), not checked."""
     return CameraFields(
         where=where,
         width=int(message.width),

@@ -33,20 +33,7 @@ POSITION_TYPES = (FIX_TYPE, "geometry_msgs/msg/PointStamped")
 
 
 def open_streams(path: Path, names: Sequence[str]) -> list[TopicStream]:
-    """Return the streams of a bag.
-
-    Parameters
-    ----------
-    path : Path
-        `.bag`, `.mcap` or `.db3` file, or a ROS 2 bag folder.
-    names : sequence of str
-        Topics; empty: the only one there is.
-
-    Raises
-    ------
-    RecordingError
-        When the bag cannot be read or does not hold the topics.
-    """
+    """Return the streams of a bag's topics of poses; without names, of the only one there is."""
     reader = BagReader(path)
     streams = [TopicStream(reader, topic) for topic in find_topics(reader, names, str(path))]
     streams[0].decisions[:0] = reader.notes
@@ -56,28 +43,7 @@ def open_streams(path: Path, names: Sequence[str]) -> list[TopicStream]:
 def find_topics(
     reader: MessageReader, names: Sequence[str], where: str, *, types: Sequence[str] = POSE_TYPES
 ) -> list[Topic]:
-    """Find the topics of poses that were asked for, or the only one there is.
-
-    Parameters
-    ----------
-    reader : MessageReader
-    names : sequence of str
-        With or without the leading slash; empty: the only topic of poses is taken.
-    where : str
-        The bag, for messages.
-    types : sequence of str
-        Of the messages.
-
-    Returns
-    -------
-    list of Topic
-        In the order of the names.
-
-    Raises
-    ------
-    RecordingError
-        When a name is unknown, or none is given and there is not exactly one topic of poses.
-    """
+    """Find the topics that were asked for; without names the only one there is."""
     found = [topic for topic in reader.topics if topic.type in types and topic.n_messages]
     if names:
         return [_find(name, found, where) for name in names]
@@ -102,12 +68,6 @@ def _find(name: str, topics: Sequence[Topic], where: str) -> Topic:
 class TopicStream:
     """The poses of one topic of a bag.
 
-    Parameters
-    ----------
-    reader : MessageReader
-    topic : Topic
-        Of one of `POSE_TYPES`.
-
     Attributes
     ----------
     parent_frame, child_frame : str
@@ -126,13 +86,7 @@ class TopicStream:
         self._has_frames = False
 
     def samples(self, faults: InputFaults) -> Iterator[PoseSample]:
-        """Yield the poses in the order of recording; skip and count what holds none.
-
-        Raises
-        ------
-        RecordingError
-            When the bag cannot be read on.
-        """
+        """Yield the poses in the order of recording; skip and count what holds none."""
         n_messages = 0
         for message in self._reader.messages([self._topic.name]):
             if message.topic.type != self._topic.type:
@@ -153,7 +107,6 @@ class TopicStream:
             )
 
     def _is_of_the_frames(self, message: Any, faults: InputFaults) -> bool:  # noqa: ANN401
-        """Tell whether a message is of the frames that the first one is of."""
         names = (message.header.frame_id, getattr(message, "child_frame_id", ""))
         parent, child = map(bare, names)
         if not self._has_frames:
@@ -205,10 +158,8 @@ class Positions:
         Strictly increasing, nanoseconds.
     positions : ndarray of float64, shape (n, 3)
         In the parent frame, metres.
-    parent_frame : str
+    parent_frame, child_frame : str
         Empty where the messages name none.
-    child_frame : str
-        Of the point that was measured; empty where the messages name none.
     origin : str
         Of the parent frame, where it was chosen here: the first fix, in words.
     """
@@ -221,23 +172,10 @@ class Positions:
 
 
 def read_positions(reader: MessageReader, topic: Topic, faults: InputFaults) -> Positions:
-    """Read the positions of a topic.
+    """Read the positions of a topic; skip and count what holds none.
 
     Those of `NavSatFix` are east, north and up of the first fix. A status below zero, or a
     number that is no place on Earth, is no fix.
-
-    Parameters
-    ----------
-    reader : MessageReader
-    topic : Topic
-        Of one of `POSITION_TYPES`.
-    faults : InputFaults
-        Notes messages that hold no position.
-
-    Raises
-    ------
-    RecordingError
-        When the bag cannot be read on, or no message holds a position.
     """
     rows: dict[int, FloatArray] = {}
     frame: str | None = None

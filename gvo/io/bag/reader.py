@@ -145,17 +145,10 @@ class BagReader:
     def messages(
         self, names: Collection[str], *, files: Sequence[BagFile] | None = None
     ) -> Iterator[BagMessage]:
-        """Yield the messages of some topics in the order of recording, over all files.
+        """Yield the messages of some topics in the order of recording, over all files or some.
 
         What is damaged is left out, see `damage`; in a file without an index the order is that
         of its chunks. A file is opened when its first message is due.
-
-        Parameters
-        ----------
-        names : collection of str
-            Topics as listed.
-        files : sequence of BagFile, optional
-            Some of the files; all where omitted.
         """
         topics = {(topic.name, topic.type): topic for topic in self.topics}
         streams = [
@@ -229,35 +222,14 @@ def typestore(*, is_ros1: bool) -> Typestore:
 
 
 def serialize(message: object, type_: str, *, is_ros1: bool) -> bytes:
-    """Return the bytes of a message, as ROS 1 has them or as CDR.
-
-    Parameters
-    ----------
-    message : object
-        Of a class of `typestore`.
-    type_ : str
-        `package/msg/Name`.
-    is_ros1 : bool
-    """
+    """Return the bytes of a message of a class of `typestore`, as ROS 1 has them or as CDR."""
     store = typestore(is_ros1=is_ros1)
     return bytes((store.serialize_ros1 if is_ros1 else store.serialize_cdr)(message, type_))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FolderFiles:
-    """What a folder holds.
-
-    Parameters
-    ----------
-    paths : tuple of Path
-        The files to read; those that end in `.zstd` are compressed.
-    notes : tuple of str
-        What was decided.
-    damage : tuple of str
-        What is missing.
-    is_listed : bool
-        Whether the metadata name them.
-    """
+    """What a folder holds; files that end in `.zstd` are compressed."""
 
     paths: tuple[Path, ...]
     notes: tuple[str, ...] = ()
@@ -270,15 +242,6 @@ def find_files(folder: Path) -> FolderFiles:
 
     The metadata only name them. All else that they say is in the files too, and not always the
     same: readers that compare the two find no messages then.
-
-    Parameters
-    ----------
-    folder : Path
-
-    Raises
-    ------
-    RecordingError
-        When there is none.
     """
     held = sorted(path for path in folder.iterdir() if is_storage(path))
     has_metadata = (folder / "metadata.yaml").is_file()
@@ -309,14 +272,13 @@ def find_files(folder: Path) -> FolderFiles:
 
 
 def _find(name: str, held: list[Path]) -> Path | None:
-    """Return the file of a name, compressed or not."""
     plain = name.removesuffix(_COMPRESSED)
     names = (name, plain, f"{plain}{_COMPRESSED}")
     return next((path for wanted in names for path in held if path.name == wanted), None)
 
 
 def _listed_files(metadata: Path) -> dict[str, str]:
-    """Return the names of the files, and for each what is known of its size, as text."""
+    """Return the names of the files, each with what is known of its size, as text."""
     try:
         text = read_text(metadata, max_bytes=_MAX_METADATA)
         content = load_yaml(text, max_characters=_MAX_METADATA)["rosbag2_bagfile_information"]
@@ -336,27 +298,7 @@ def is_storage(path: Path) -> bool:
 
 
 def unpack(path: Path, folder: Path) -> tuple[Path, str]:
-    """Decompress a file.
-
-    Parameters
-    ----------
-    path : Path
-        Ends in `.zstd`.
-    folder : Path
-        Where to.
-
-    Returns
-    -------
-    path : Path
-        The decompressed file.
-    damage : str
-        What is missing of it; nothing where nothing is.
-
-    Raises
-    ------
-    RecordingError
-        When it cannot be read or the folder cannot be written.
-    """
+    """Decompress a `.zstd` file into a folder; return the file, and what is wrong with it."""
     target = folder / path.name.removesuffix(_COMPRESSED)
     with named_faults(RecordingError, path, f"cannot be decompressed to {folder}"):
         reason = inflate_file(path, target)

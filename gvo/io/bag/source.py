@@ -90,7 +90,6 @@ class BagSource:
         calibration: CalibrationPaths,
         config: Config | None,
     ) -> None:
-        """Choose the topics of the camera and find its calibration."""
         config = config or Config()
         self._reader, self._where = reader, where
         self._tf: TfBuffer | None = None
@@ -142,18 +141,7 @@ class BagSource:
                 )
 
     def transforms(self, frames: Collection[str] | None = None) -> TfBuffer:
-        """Read `/tf` and `/tf_static`.
-
-        Parameters
-        ----------
-        frames : collection of str, optional
-            What will be looked up; of a long bag the rest is not kept.
-
-        Raises
-        ------
-        RecordingError
-            When the bag cannot be read.
-        """
+        """Read `/tf` and `/tf_static`; of a long bag only what connects these frames."""
         if self._tf is None:
             self._tf = read_tf(self._reader, frames=frames)
         return self._tf if self._tf.is_whole else read_tf(self._reader, frames=frames)
@@ -170,7 +158,7 @@ class BagSource:
         base_frame: str = "",
         T_base_cam: FloatArray | None = None,
     ) -> Truth | Failure:
-        """Return true poses of a base frame.
+        """Return true poses of a base frame, or why there are none.
 
         Parameters
         ----------
@@ -180,11 +168,6 @@ class BagSource:
             In tf; empty: the rectified left or colour camera.
         T_base_cam : ndarray of float64, shape (4, 4), optional
             Where the camera is mounted on it, if that does not come from tf.
-
-        Returns
-        -------
-        Truth or Failure
-            The failure says why there is none, or why it cannot be compared.
 
         Raises
         ------
@@ -203,13 +186,7 @@ class BagSource:
         )
 
     def ground_truth(self) -> Trajectory | None:
-        """Return T_world_cam of the rectified camera, where the bag names it ground truth.
-
-        Raises
-        ------
-        RecordingError
-            When the bag cannot be read.
-        """
+        """Return T_world_cam of the rectified camera, where the bag names it ground truth."""
         found = self.truth()
         return found.trajectory if isinstance(found, Truth) else None
 
@@ -260,7 +237,6 @@ class BagSource:
 
 
 def _describe_parts(paths: Sequence[Path], reader: BagReader, reason: str) -> str:
-    """Say that files are not one recording, which they are, and what to type."""
     names = [str(file.path) for file in reader.loose_files]
     listed = ", ".join(names[:_N_LISTED]) + (", ..." if len(names) > _N_LISTED else "")
     given = " ".join(map(str, paths[:_N_LISTED]))

@@ -37,17 +37,7 @@ _Score: TypeAlias = tuple[int, ...]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Topic:
-    """A topic of a bag.
-
-    Parameters
-    ----------
-    name : str
-        As recorded.
-    type : str
-        In the form `package/msg/Name`.
-    n_messages : int
-        As the bag announces.
-    """
+    """A topic of a bag: its name as recorded, its type in the form `package/msg/Name`."""
 
     name: str
     type: str
@@ -104,16 +94,8 @@ def choose_topics(topics: Sequence[Topic], choice: TopicChoice, where: str) -> C
 
     A stereo pair is two topics that differ in left and right, image_0 and image_1, or the like;
     an RGB-D camera is one with rgb or colour in its name and one with depth. Of the topics of
-    one camera, rectified ones are taken before raw ones, and these before compressed ones.
-
-    Parameters
-    ----------
-    topics : sequence of Topic
-        All topics of the bag.
-    choice : TopicChoice
-        What the user chose; of one topic the partner is found.
-    where : str
-        The bag, for messages.
+    one camera, rectified ones are taken before raw ones, and these before compressed ones. Where
+    the user chose one topic, its partner is found.
 
     Raises
     ------
@@ -147,21 +129,9 @@ def choose_topics(topics: Sequence[Topic], choice: TopicChoice, where: str) -> C
 
 
 def find_camera_info(image: Topic, topics: Iterable[Topic]) -> str | None:
-    """Return the name of the `CameraInfo` topic of an image topic.
+    """Return the name of the `CameraInfo` topic of an image topic; None where it has no messages.
 
     It is `camera_info` beside the image topic, below it, or beside or below its namespace.
-
-    Parameters
-    ----------
-    image : Topic
-        Of images.
-    topics : iterable of Topic
-        All that the bag holds.
-
-    Returns
-    -------
-    str or None
-        None where the bag holds none, or only one without messages.
     """
     names = {
         topic.name.strip("/"): topic.name
@@ -172,18 +142,7 @@ def find_camera_info(image: Topic, topics: Iterable[Topic]) -> str | None:
 
 
 def camera_info_names(image: Topic) -> list[str]:
-    """Return where `CameraInfo` is looked for.
-
-    Parameters
-    ----------
-    image : Topic
-        Of images.
-
-    Returns
-    -------
-    list of str
-        Names without the leading slash, best first.
-    """
+    """Return where `CameraInfo` is looked for: names without the leading slash, best first."""
     parent = image.base.rpartition("/")[0]
     grandparent = parent.rpartition("/")[0]
     places = [parent, image.base, grandparent, f"{grandparent}/info"]

@@ -38,15 +38,7 @@ _ALIKE = 1e-5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RegionOfInterest:
-    """The part of the full image that was recorded; of width 0, all of it.
-
-    Parameters
-    ----------
-    x_offset, y_offset : int
-        Its first pixel, in pixels of the full image before binning.
-    width, height : int
-        Its size, in pixels of the full image before binning.
-    """
+    """The part of the full image that was recorded, in its pixels before binning; width 0: all."""
 
     x_offset: int = 0
     y_offset: int = 0
@@ -98,13 +90,7 @@ class CameraFields:
         return max(self.binning[0], 1), max(self.binning[1], 1)
 
     def recorded_size(self) -> tuple[int, int]:
-        """Return width and height of the image as recorded, after region and binning.
-
-        Raises
-        ------
-        CalibrationError
-            When the region lies outside the full image.
-        """
+        """Return width and height of the image as recorded, after region and binning."""
         roi = self.roi
         width = roi.width or self.width - roi.x_offset
         height = roi.height or self.height - roi.y_offset
@@ -123,20 +109,7 @@ def make_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibration
     """Check the fields of a `CameraInfo` and return the calibration of the recorded image.
 
     Binning and region move K and P alike, by the raw region, as ROS's `PinholeCameraModel` does
-    it; `do_rectify` does not matter there either.
-
-    Parameters
-    ----------
-    fields : CameraFields
-        Raw numbers.
-    is_rectified : bool
-        The images are rectified already: only P counts.
-
-    Raises
-    ------
-    CalibrationError
-        When the camera is not calibrated, its distortion model is not known, a matrix is
-        malformed, or the region lies outside the image.
+    it; `do_rectify` does not matter there either. Of rectified images only P counts.
     """
     K, R, P = _matrices(fields)
     model, D = _distortion(fields, is_rectified=is_rectified)
@@ -156,24 +129,8 @@ def make_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibration
 def make_rgbd_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibration:
     """Check the fields of an RGB-D camera's `CameraInfo` and return the calibration.
 
-    Depth is measured along the axis of the raw camera: where rectification turns the camera,
-    the depth of a pixel would have to change with it.
-
-    Parameters
-    ----------
-    fields : CameraFields
-        Raw numbers of the colour camera.
-    is_rectified : bool
-        The images are rectified already: only P counts.
-
-    Returns
-    -------
-    Calibration
-
-    Raises
-    ------
-    CalibrationError
-        As `make_calibration`, and when R of raw images is not the identity.
+    Depth is measured along the axis of the raw camera: where R turns the camera, the depth of a
+    pixel would have to change with it, so that R of raw images must be the identity.
     """
     calibration = make_calibration(fields, is_rectified=is_rectified)
     if not is_rectified and not np.allclose(calibration.R, np.eye(3), atol=ROTATION_TOLERANCE):
@@ -198,14 +155,7 @@ def rectified_calibration(P: FloatArray, *, width: int, height: int) -> Calibrat
 
 
 def check_camera(calibration: Calibration, where: str) -> None:
-    """Check the size and the intrinsics of a rectified camera; messages begin with `where`.
-
-    Raises
-    ------
-    CalibrationError
-        When a focal length or the image size is not positive, or the image is larger than
-        `MAX_SIDE_PX` a side, or `MAX_PIXELS`.
-    """
+    """Check the size and the intrinsics of a rectified camera; messages begin with `where`."""
     width, height = calibration.width, calibration.height
     if max(width, height) > MAX_SIDE_PX or width * height > MAX_PIXELS:
         raise CalibrationError(
@@ -252,13 +202,7 @@ def _check_matrices(K: FloatArray, R: FloatArray, P: FloatArray, where: str) -> 
 
 
 def read_array(values: object, shape: tuple[int, ...], what: str) -> FloatArray:
-    """Read the numbers of an array, in rows; as `read_numbers`.
-
-    Raises
-    ------
-    CalibrationError
-        Also when there are more or less.
-    """
+    """Read so many numbers as an array, in rows."""
     numbers, n_expected = read_numbers(values, what), int(np.prod(shape))
     if numbers.size != n_expected:
         raise CalibrationError(f"{what} must hold {n_expected} numbers, got {numbers.size}")
@@ -296,24 +240,7 @@ def _alternatives(counts: set[int]) -> str:
 
 
 def read_numbers(values: object, what: str) -> FloatArray:
-    """Read the numbers of a file or message as a flat array.
-
-    Parameters
-    ----------
-    values : object
-        Numbers, nested or not; texts of numbers, as YAML reads `1e-5`.
-    what : str
-        File and key, for messages.
-
-    Returns
-    -------
-    ndarray of float64, shape (n,)
-
-    Raises
-    ------
-    CalibrationError
-        When they are no numbers, not finite, or larger than any calibration holds.
-    """
+    """Read numbers, nested or not, as a flat array; texts too, as YAML reads `1e-5`."""
     try:
         numbers = np.array(cast(ArrayLike, values), dtype=np.float64).ravel()
     except (TypeError, ValueError, OverflowError) as error:
@@ -331,20 +258,7 @@ def has_baseline(left: Calibration, right: Calibration) -> bool:
 
 
 def stereo_baseline(calibrations: tuple[Calibration, Calibration], where: str) -> float:
-    """Return the baseline of a rectified pair in metres.
-
-    Parameters
-    ----------
-    calibrations : tuple of two Calibration
-        Left and right.
-    where : str
-        File or topics, for the message.
-
-    Raises
-    ------
-    CalibrationError
-        When they are no rectified pair, naming where they come from.
-    """
+    """Return the baseline of a rectified pair in metres; refuse what is no rectified pair."""
     left, right = calibrations
     if (left.width, left.height) == (right.width, right.height) and not has_baseline(left, right):
         raise CalibrationError(
@@ -359,27 +273,10 @@ def stereo_baseline(calibrations: tuple[Calibration, Calibration], where: str) -
 def pair_of_extrinsics(
     raw: tuple[Calibration, Calibration], T_left_right: FloatArray, where: str
 ) -> tuple[Calibration, Calibration]:
-    """Rectify a pair of raw cameras by the transform between them.
+    """Rectify a pair of raw cameras by the transform between them, metres.
 
-    Parameters
-    ----------
-    raw : tuple of two Calibration
-        Left and right; their R and P are not read.
-    T_left_right : ndarray of float64, shape (4, 4)
-        Maps coordinates of the right raw camera to the left one, metres.
-    where : str
-        Files or topics, for messages.
-
-    Returns
-    -------
-    tuple of two Calibration
-        Rectified already where the cameras are alike, without distortion and side by side;
-        otherwise with R and P of `rectify_stereo`.
-
-    Raises
-    ------
-    CalibrationError
-        When they cannot be rectified.
+    The pair is taken as rectified already where the cameras are alike, without distortion and
+    side by side; otherwise R and P are those of `rectify_stereo`.
     """
     left, right = raw
     if _is_rectified_pair(left, right, T_left_right):
@@ -396,22 +293,9 @@ def pair_of_extrinsics(
 def pair_of_baseline(
     rectified: tuple[Calibration, Calibration], T_left_right: FloatArray, where: str
 ) -> tuple[Calibration, Calibration]:
-    """Set the baseline of a rectified pair by the transform between the cameras.
+    """Set the baseline of a rectified pair by the transform between the cameras, metres.
 
-    Parameters
-    ----------
-    rectified : tuple of two Calibration
-        Left and right.
-    T_left_right : ndarray of float64, shape (4, 4)
-        Maps coordinates of the right rectified camera to the left one, metres.
-    where : str
-        What told the transform, for messages.
-
-    Raises
-    ------
-    CalibrationError
-        When the transform is more than a shift to the side, as it must be between rectified
-        cameras.
+    Refuse more than a shift to the side, as it must be between rectified cameras.
     """
     left, right = rectified
     x, y, z = (float(value) for value in T_left_right[:3, 3])

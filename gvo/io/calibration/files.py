@@ -113,13 +113,7 @@ def read_cameras(paths: CalibrationPaths, *, sensor: Sensor, is_rectified: bool)
 
 
 def paths_of(calibration: CalibrationPaths, *own: Path) -> tuple[Path, ...]:
-    """Return the paths that were given, else those of the recording itself, which must be there.
-
-    Raises
-    ------
-    CalibrationError
-        With the way out.
-    """
+    """Return the paths that were given, else those of the recording itself, which must be there."""
     given = (calibration,) if isinstance(calibration, Path) else tuple(calibration or ())
     for path in () if given else own:
         if fault := access_fault(path):
@@ -128,12 +122,11 @@ def paths_of(calibration: CalibrationPaths, *own: Path) -> tuple[Path, ...]:
 
 
 def pose_of_rectified(T_body_raw: FloatArray, camera: Calibration) -> FloatArray:
-    """Return T_body_cam of the rectified camera, shape (4, 4), of that of the raw one."""
+    """Return T_body_cam of the rectified camera of that of the raw one."""
     return T_body_raw @ se3.make_transform(camera.R.T, np.zeros(3))
 
 
 def _files_of(path: Path) -> tuple[Path, ...]:
-    """Return the path itself, or the files of a folder."""
     if not path.is_dir():
         return (path,)
     for root in (path / "mav0", path):
@@ -222,44 +215,25 @@ class DescribedCamera:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CalibrationFile:
-    """What a calibration file holds.
-
-    Parameters
-    ----------
-    cameras : tuple of DescribedCamera
-        One camera; left and right; or those of a chain in its order.
-    depth_scale : float, optional
-        Counts per metre of integer depth.
-    """
+    """One camera, a pair or a chain; and the counts per metre of integer depth."""
 
     cameras: tuple[DescribedCamera, ...]
     depth_scale: float | None = None
 
 
 def read_calibration_file(path: Path) -> CalibrationFile:
-    """Read a calibration file of any known form.
+    """Read a calibration file: YAML of any of these forms.
 
-    Parameters
-    ----------
-    path : Path
-        YAML of
+    - ROS's camera_calibration: `image_width`, `image_height`, `camera_matrix`,
+      `distortion_coefficients`, `distortion_model`, optionally `rectification_matrix` and
+      `projection_matrix`; or of `CameraInfo`: `width`, `height`, `k`, `d`, `r`, `p`, with
+      `binning_x`, `binning_y` and `roi`; two of them under `left` and `right` are a pair;
+    - Kalibr: `cam0`, `cam1` with `intrinsics`, `resolution`, `distortion_model`,
+      `distortion_coeffs`, `T_cn_cnm1`, optionally `T_cam_imu`;
+    - EuRoC: `intrinsics`, `resolution`, `distortion_model`, `distortion_coefficients`, `T_BS`;
+    - OpenCV's FileStorage with the keys of ROS, or with `LEFT.K` and so on.
 
-        - ROS's camera_calibration: `image_width`, `image_height`, `camera_matrix`,
-          `distortion_coefficients`, `distortion_model`, optionally `rectification_matrix` and
-          `projection_matrix`; or of `CameraInfo`: `width`, `height`, `k`, `d`, `r`, `p`, with
-          `binning_x`, `binning_y` and `roi`; two of them under `left` and `right` are a pair;
-        - Kalibr: `cam0`, `cam1` with `intrinsics`, `resolution`, `distortion_model`,
-          `distortion_coeffs`, `T_cn_cnm1`, optionally `T_cam_imu`;
-        - EuRoC: `intrinsics`, `resolution`, `distortion_model`, `distortion_coefficients`,
-          `T_BS`;
-        - OpenCV's FileStorage with the keys of ROS, or with `LEFT.K` and so on.
-
-        A file of one camera may hold `depth_scale` (counts per metre).
-
-    Raises
-    ------
-    CalibrationError
-        When it cannot be read or lacks a key.
+    A file of one camera may hold `depth_scale` (counts per metre).
     """
     content = read_yaml(path)
     chain = {int(match[1]): key for key in content if (match := _KALIBR_CAMERA.fullmatch(str(key)))}
@@ -412,23 +386,7 @@ def _array(content: Mapping[Any, Any], key: str, shape: tuple[int, ...], where: 
 
 
 def read_yaml(path: Path) -> dict[Any, Any]:
-    """Read a YAML file of keys.
-
-    Parameters
-    ----------
-    path : Path
-        Text.
-
-    Returns
-    -------
-    dict
-        Values by key.
-
-    Raises
-    ------
-    CalibrationError
-        When it is missing, malformed or holds no keys.
-    """
+    """Read a YAML file of keys; of several documents, as `ros2 topic echo` prints, the first."""
     try:
         with named_faults(CalibrationError, path, "the calibration cannot be read"):
             text = read_text(path, max_bytes=MAX_CHARACTERS)

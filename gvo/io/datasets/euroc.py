@@ -66,13 +66,7 @@ class EurocSource(FolderSource):
         super().__init__(named, cameras, images, decisions, config)
 
     def ground_truth(self) -> Trajectory | None:
-        """Return T_world_cam of the rectified left camera.
-
-        Raises
-        ------
-        TrajectoryError
-            When the file is malformed.
-        """
+        """Return T_world_cam of the rectified left camera."""
         path = self._root / _TRUTH
         if not path.is_file():
             return None

@@ -43,7 +43,7 @@ class FolderSource:
     decisions : sequence of str
         What was chosen beside the streams, a line each.
     config : Config, optional
-        Of grey and colour images with 16 bits; the defaults when left out.
+        Of images with 16 bits.
     load_second : callable, optional
         Reads a file of the second stream; as a colour or grey image when left out.
     """
@@ -95,24 +95,9 @@ def _stream(stream: int, rows: Sequence[StampedPath], load: Load) -> Iterator[St
 def read_stamped_rows(
     path: Path, *, unit_ns: int, n_fields: int = 2, separator: str | None = None
 ) -> list[tuple[int, str]]:
-    """Read a table whose first field is a stamp, its second perhaps a name.
+    """Read a table of stamps, in units of `unit_ns`, each perhaps with a name behind it.
 
-    Parameters
-    ----------
-    path, n_fields, separator
-        As of `read_rows`.
-    unit_ns : int
-        Nanoseconds of the stamps' unit: 1_000_000_000 for seconds, 1 for nanoseconds.
-
-    Returns
-    -------
-    list of (int, str)
-        Stamp in nanoseconds, without loss, and the field behind it; empty where there is none.
-
-    Raises
-    ------
-    RecordingError
-        As `read_rows`, and when a stamp is no number or out of range.
+    Stamps become nanoseconds without loss; a missing name is empty.
     """
     rows = []
     for number, (stamp, *fields) in read_rows(path, n_fields=n_fields, separator=separator):
@@ -127,27 +112,7 @@ def read_stamped_rows(
 def read_rows(
     path: Path, *, n_fields: int, separator: str | None = None
 ) -> Iterator[tuple[int, list[str]]]:
-    """Yield the rows of a table, without comments and empty lines.
-
-    Parameters
-    ----------
-    path : Path
-        Text file.
-    n_fields : int
-        Fields a row must hold at least.
-    separator : str, optional
-        Between the fields; white space when None.
-
-    Yields
-    ------
-    int, list of str
-        Line number, counted from one, and fields.
-
-    Raises
-    ------
-    RecordingError
-        When the file cannot be read, holds no row, or a row is too short.
-    """
+    """Yield line numbers, from one, and fields of a table, without comments and empty lines."""
     is_empty = True
     for number, line in text_lines(path, RecordingError, max_lines=_MAX_ROWS):
         text = line.strip()

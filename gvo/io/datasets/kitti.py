@@ -72,15 +72,7 @@ class KittiSource(FolderSource):
         super().__init__(folder, cameras, images, decisions, config)
 
     def ground_truth(self) -> Trajectory | None:
-        """Return T_world_cam of the left camera; the world is the first grey left camera.
-
-        Raises
-        ------
-        TrajectoryError
-            When the file is malformed.
-        RecordingError
-            When it does not have a row per row of `times.txt`.
-        """
+        """Return T_world_cam of the left camera; the world is the first grey left camera."""
         official = self._folder.resolve().parents[1] / "poses" / f"{self.info.name}.txt"
         files = filter(Path.is_file, (self._folder / "poses.txt", official))
         return next(map(self._read_truth, files), None)

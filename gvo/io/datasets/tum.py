@@ -83,13 +83,7 @@ class TumSource(FolderSource):
         super().__init__(folder, cameras, images, decisions, config, load_second=load_depth)
 
     def ground_truth(self) -> Trajectory | None:
-        """Return T_world_cam of the colour camera.
-
-        Raises
-        ------
-        TrajectoryError
-            When the file is malformed.
-        """
+        """Return T_world_cam of the colour camera."""
         path = self._folder / "groundtruth.txt"
         return read_trajectory(path) if path.is_file() else None
 
@@ -119,18 +113,7 @@ def _find_calibration(folder: Path, explicit: tuple[Path, ...]) -> CameraSet:
 
 
 def published_calibration(name: str) -> Calibration | None:
-    """Return the published calibration of the camera that a folder's name tells.
-
-    Parameters
-    ----------
-    name : str
-        Of the folder.
-
-    Returns
-    -------
-    Calibration or None
-        None where the name tells none of the three cameras.
-    """
+    """Return the published calibration of the camera that a folder's name tells, if any."""
     named = _CAMERA_NAME.search(name.lower())
     return None if named is None else _published_camera(*_CAMERAS[named[1]])
 
@@ -154,8 +137,7 @@ def _published_camera(
 def _assume_scale(paths: Iterable[str]) -> tuple[float, str]:
     """Choose between the two scales in use by the first depth image that can be read.
 
-    The scale of TUM's tools unless the scene would then be nearer than such a camera can see,
-    and millimetres put it where it can.
+    Millimetres where the scene would otherwise be nearer than such a camera can see.
     """
     for path in map(Path, paths):
         try:

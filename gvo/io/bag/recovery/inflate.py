@@ -35,27 +35,9 @@ class DamageError(Exception):
 def inflate(
     data: bytes, compression: str, *, limit: int = MAX_INFLATED
 ) -> tuple[bytes, bytes | None]:
-    """Decompress the first stream in some data.
+    """Decompress the first stream in some data, into at most `limit` bytes.
 
-    Parameters
-    ----------
-    data : bytes
-    compression : str
-        "bz2", "lz4" or "zstd".
-    limit : int
-        Maximum number of decompressed bytes.
-
-    Returns
-    -------
-    bytes
-        The content; of a truncated stream its start.
-    bytes or None
-        What follows the stream; None where it is truncated.
-
-    Raises
-    ------
-    DamageError
-        When the data are invalid, or exceed the limit.
+    Return the content, and what follows the stream: None where it is truncated.
     """
     if compression not in _DECOMPRESSORS:
         raise DamageError(f"a chunk of unknown compression {compression!r}")

@@ -94,10 +94,6 @@ class Losses:
 class Scan(ABC):
     """The messages of a file, read record by record.
 
-    Parameters
-    ----------
-    path : Path
-
     Attributes
     ----------
     counts : dict of Channel to int
