@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from gvo.io.opening import RecordingOptions as RecordingOptions
     from gvo.io.opening import open_recording as open_recording
     from gvo.io.poses.inputs import read_ground_truth as read_ground_truth
-    from gvo.io.synthetic.recording import SyntheticRecording as SyntheticRecording
+    from gvo.io.synthetic import SyntheticRecording as SyntheticRecording
     from gvo.odometry.loops import LoopDetector as LoopDetector
     from gvo.odometry.odometry import Odometry as Odometry
     from gvo.runs.outputs.options import RunOutputs as RunOutputs
@@ -80,7 +80,7 @@ _MODULES = {
     "gvo.io.excerpt": ("Excerpt",),
     "gvo.io.frames": ("Rig", "frames"),
     "gvo.io.opening": ("RecordingOptions", "open_recording"),
-    "gvo.io.synthetic.recording": ("SyntheticRecording",),
+    "gvo.io.synthetic": ("SyntheticRecording",),
     "gvo.trajectory.evaluation": ("Evaluation", "evaluate", "format_evaluations"),
     "gvo.trajectory.formats": ("read_trajectory",),
     "gvo.trajectory.trajectory": ("Trajectory",),

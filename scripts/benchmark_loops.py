@@ -34,8 +34,7 @@ import gvo
 from gvo.geometry import se3
 from gvo.io.recording import Source
 from gvo.io.run_folder.reader import RunRecord, read_run
-from gvo.testing.faults import Black, FaultyImage, FaultySource, PixelFault
-from gvo.testing.faults.fault import Pixels
+from gvo.testing.faults import Black, FaultyImage, FaultySource, PixelFault, Pixels
 from gvo.trajectory.alignment import associate
 from gvo.trajectory.g2o import Measurement, parse_line
 from gvo.types import FloatArray, IntArray
@@ -109,9 +108,9 @@ class Breathing(PixelFault):
 
     amount: float = 0.012
 
-    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
+    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
         """Return the image, magnified about its middle."""
-        turns = 1e-9 * image.stamp_ns / BREATH_S
+        turns = 1e-9 * image.given.stamp_ns / BREATH_S
         scale = 1.0 + self.amount * np.sin(2.0 * np.pi * turns)
         height, width = pixels.shape[:2]
         M = cv2.getRotationMatrix2D((0.5 * (width - 1), 0.5 * (height - 1)), 0.0, scale)

@@ -8,10 +8,12 @@ where it holds them. A seed gives the same images on every machine; kept as bags
 by other versions of the package.
 """
 
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+sys.path.append(str(Path(__file__).parents[1]))  # for the worlds of the tests
 import benchmark_passes as passes  # type: ignore[import-not-found]  # beside this one
 import benchmark_tables as tables  # type: ignore[import-not-found]
 import numpy as np
@@ -22,6 +24,7 @@ from gvo.io.recording import Sensor, Source
 from gvo.runs.loop import edge_over, motions_of_window
 from gvo.trajectory.evaluation import Motions, consistency, motions_of_chain
 from gvo.types import Edge, FloatArray
+from tests.worlds import rendered
 
 
 @dataclass(frozen=True)
@@ -96,8 +99,8 @@ class Recordings:
     def rendered(self, seed: int) -> Source:
         """Return the recording of a seed, rendered while it is read."""
         try:
-            return gvo.SyntheticRecording(
-                KINDS[self.kind].world,  # type: ignore[arg-type]
+            return rendered(
+                KINDS[self.kind].world,
                 self.sensor,
                 n_frames=self.n_frames,
                 seed=seed,

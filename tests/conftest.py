@@ -157,7 +157,7 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 @pytest.fixture(scope="session")
 def drive_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a bag of a short rendered drive, a stereo camera at half size."""
-    from gvo.io.synthetic.recording import SyntheticRecording
+    from gvo.io.synthetic import SyntheticRecording
 
     path = tmp_path_factory.mktemp("bags") / "drive.mcap"
     gvo.convert(SyntheticRecording("driving", "stereo", n_frames=20, scale=0.5), path)
@@ -167,7 +167,7 @@ def drive_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def room_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a bag of a short walk in a rendered room, an RGB-D camera at half size."""
-    from gvo.io.synthetic.recording import SyntheticRecording
+    from gvo.io.synthetic import SyntheticRecording
 
     path = tmp_path_factory.mktemp("bags") / "room.bag"
     gvo.convert(SyntheticRecording("handheld", "rgbd", n_frames=20, scale=0.5), path)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import gvo
 from gvo.errors import RecordingError
 from gvo.io.recording import RecordingInfo, Source, StampedImage
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame, Frame
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from gvo.geometry.se3 import make_transform
 from gvo.io.recording import RecordingInfo, StampedImage
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from gvo.io.synthetic.worlds.motion import look_around
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray

@@ -15,7 +15,7 @@ from gvo.io.convert.bag_writer import write_bag
 from gvo.io.opening import open_recording
 from gvo.io.run_folder.line_file import check_new
 from gvo.io.run_folder.writer import check_unused
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from gvo.runs.run import RunResult, run_recording
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Progress

@@ -30,7 +30,7 @@ _AGREEMENT_SIGMAS = 5.0
 _NEGLIGIBLE_RAD = 1e-4
 _NEGLIGIBLE_M = 1e-3
 # A prior is made wrong by so many sigmas, but not by more than a search has to forgive.
-_PRIOR_SIGMAS = 10.0
+_PRIOR_SIGMAS = np.array([10.0, -10.0, 10.0, -10.0, 10.0, -10.0])
 _PRIOR_LIMITS = np.repeat([0.005, 0.02], 3)
 _SHIFT_PX = 3
 _SHIFT_DEPTH_M = 5.0
@@ -88,41 +88,26 @@ def check_frontend(
     """
     if len(frames) < 3:
         raise ValueError(f"the contract is checked on at least three frames, got {len(frames)}")
-    observations = [_check_extract(frontend, frame) for frame in frames]
-    for each in observations[:3]:
-        _check_standing_still(frontend, each)
-    results = [_check_pair(frontend, *pair) for pair in pairwise(observations)]
-    for pair, result in zip(pairwise(observations), results, strict=True):
+    _check_capabilities(frontend)
+    seen = [_extract(frontend, frame) for frame in frames]
+    for each in seen[:3]:
+        result = _find(frontend, each, each)
+        name = f"register of the frame at {each.stamp_ns} with itself and the identity"
+        _check_agreement(name, result.T_reference_current, result.covariance)
+    results = [_find(frontend, *pair) for pair in pairwise(seen)]
+    for pair, result in zip(pairwise(seen), results, strict=True):
         _check_inverse(frontend, result, *pair)
         _check_prior(frontend, result, *pair)
-    _check_direction(frontend, *frames[:2])
-    _check_capabilities(frontend)
-    for nothing in _without_anything(frames[0], frames[-1], blank):
-        _check_places(CheckedFrontend(frontend).recognizer, observations[0], nothing)
-        _check_nothing_seen(frontend, observations[0], nothing)
+    if isinstance(frames[0], StereoFrame | RgbdFrame):
+        _check_direction(frontend, frames[0], frames[1].stamp_ns + 1)
+    for nothing in _without_anything(frames[0], frames[-1].stamp_ns, blank):
+        _check_places(CheckedFrontend(frontend).recognizer, seen[0], nothing)
+        _check_nothing_seen(frontend, seen[0], nothing)
 
 
 def _require(is_kept: bool | np.bool_, message: str) -> None:
     if not is_kept:
         raise ContractError(message)
-
-
-def _check_extract(frontend: Frontend[Any], frame: Stamped) -> Stamped:
-    before = fingerprint(frame)
-    first = frontend.extract(frame)
-    _require(fingerprint(frame) == before, f"extract changes the frame at {frame.stamp_ns}")
-    second = frontend.extract(frame)
-    stamp_ns = getattr(first, "stamp_ns", None)
-    _require(
-        stamp_ns == frame.stamp_ns,
-        f"extract must keep the stamp {frame.stamp_ns}, its observations have {stamp_ns}",
-    )
-    _require(
-        fingerprint(first) == fingerprint(second),
-        f"extract gives other observations of the frame at {frame.stamp_ns} when called again",
-    )
-    observations: Stamped = first
-    return observations
 
 
 def _check_capabilities(frontend: Frontend[Any]) -> None:
@@ -133,11 +118,28 @@ def _check_capabilities(frontend: Frontend[Any]) -> None:
             value is None or isinstance(value, kinds),
             f"{name} is a {type(value).__name__}, which is none of {kinds}",
         )
-    for name in ("reconfigure", "describe", "recognize"):
-        method = getattr(frontend, name, None)
+    methods = {n: getattr(frontend, n, None) for n in ("reconfigure", "describe", "recognize")}
+    for name, method in methods.items():
         _require(method is None or callable(method), f"{name} must be a method")
-    is_there = [getattr(frontend, name, None) is not None for name in ("describe", "recognize")]
-    _require(is_there[0] == is_there[1], "of describe and recognize, one needs the other")
+    is_alone = (methods["describe"] is None) != (methods["recognize"] is None)
+    _require(not is_alone, "of describe and recognize, one needs the other")
+
+
+def _extract(frontend: Frontend[Any], frame: Stamped) -> Stamped:
+    """Extract twice; check the stamp, and that nothing changes."""
+    before = fingerprint(frame)
+    first: Stamped = frontend.extract(frame)
+    _require(fingerprint(frame) == before, f"extract changes the frame at {frame.stamp_ns}")
+    stamp_ns = getattr(first, "stamp_ns", None)
+    _require(
+        stamp_ns == frame.stamp_ns,
+        f"extract must keep the stamp {frame.stamp_ns}, its observations have {stamp_ns}",
+    )
+    _require(
+        fingerprint(first) == fingerprint(frontend.extract(frame)),
+        f"extract gives other observations of the frame at {frame.stamp_ns} when called again",
+    )
+    return first
 
 
 def _register(
@@ -158,108 +160,22 @@ def _register(
         fingerprint(first) == fingerprint(second),
         f"{name} gives another result when called again with the same arguments",
     )
-    if isinstance(first, RelativePose):
-        fault = find_fault(first)
-        _require(not fault, f"{name}: {fault}")
+    fault = find_fault(first) if isinstance(first, RelativePose) else ""
+    _require(not fault, f"{name}: {fault}")
     return first
 
 
-def _check_pair(frontend: Frontend[Any], reference: Stamped, current: Stamped) -> RelativePose:
+def _find(frontend: Frontend[Any], reference: Stamped, current: Stamped) -> RelativePose:
+    """Register two frames that see the same."""
     result = _register(frontend, reference, current, None)
     if isinstance(result, Failure):
-        raise ContractError(
-            f"register({reference.stamp_ns}, {current.stamp_ns}) fails on consecutive frames: "
-            f"{result.reason}"
-        )
+        name = f"register({reference.stamp_ns}, {current.stamp_ns})"
+        raise ContractError(f"{name} fails on consecutive frames: {result.reason}")
     return result
 
 
-def _check_standing_still(frontend: Frontend[Any], observations: Stamped) -> None:
-    result = _check_pair(frontend, observations, observations)
-    _check_agreement(
-        f"register of the frame at {observations.stamp_ns} with itself and the identity",
-        result.T_reference_current,
-        result.covariance,
-    )
-
-
-def _check_inverse(
-    frontend: Frontend[Any], forth: RelativePose, reference: Stamped, current: Stamped
-) -> None:
-    back = _check_pair(frontend, current, reference)
-    covariance = se3.compose_covariance(forth.covariance, back.T_reference_current, back.covariance)
-    _check_agreement(
-        f"register({reference.stamp_ns}, {current.stamp_ns}) and the inverse of what it gives "
-        "the other way round",
-        forth.T_reference_current @ back.T_reference_current,
-        covariance,
-    )
-
-
-def _check_prior(
-    frontend: Frontend[Any], result: RelativePose, reference: Stamped, current: Stamped
-) -> None:
-    T, T_wrong = result.T_reference_current, _misled(result)
-    name = f"register({reference.stamp_ns}, {current.stamp_ns})"
-    for kind, prior in (
-        ("a prior", MotionPrior(T_predicted=T)),
-        ("a prior", MotionPrior(T_predicted=T_wrong)),
-        ("a recent median motion", MotionPrior(T_predicted=T, T_recent=T)),
-        ("a recent median motion", MotionPrior(T_predicted=T, T_recent=T_wrong)),
-    ):
-        guided = _register(frontend, reference, current, prior)
-        if isinstance(guided, Failure):
-            raise ContractError(f"{name} fails with {kind} and not without: {guided.reason}")
-        _check_agreement(
-            f"{name} with and without {kind}",
-            se3.invert(T) @ guided.T_reference_current,
-            result.covariance + guided.covariance,
-        )
-
-
-def _misled(result: RelativePose) -> FloatArray:
-    """Return a motion that is off by more sigmas than chance would have it."""
-    sigmas: FloatArray = np.sqrt(np.diag(result.covariance))
-    signs = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
-    error: FloatArray = signs * np.minimum(_PRIOR_SIGMAS * sigmas, _PRIOR_LIMITS)
-    return np.asarray(result.T_reference_current @ se3.exp(error))
-
-
-def _check_places(recognizer: Recognizer | None, observations: Stamped, frame: Stamped) -> None:
-    """Recognize a frame in its own place, and one without anything not."""
-    if recognizer is None:
-        return
-    name = f"recognize of the frame at {observations.stamp_ns} in its own place"
-    place, nothing = _place_of(recognizer, observations), recognizer.extract(frame)
-    result = recognizer.recognize(place, place, observations)
-    if isinstance(result, Failure):
-        raise ContractError(f"{name} fails: {result.reason}")
-    _require(not find_fault(result), f"{name}: {find_fault(result)}")
-    _check_agreement(name, result.T_reference_current, result.covariance)
-    result = recognizer.recognize(place, _place_of(recognizer, nothing), nothing)
-    _require(
-        isinstance(result, Failure),
-        f"frames without anything in common ({observations.stamp_ns}, {frame.stamp_ns}) are "
-        "recognized",
-    )
-
-
-def _place_of(recognizer: Recognizer, observations: Stamped) -> Any:  # noqa: ANN401
-    name = f"describe of the frame at {observations.stamp_ns}"
-    place, again = (recognizer.describe(observations) for _ in range(2))
-    _require(fingerprint(place) == fingerprint(again), f"{name} gives another place when repeated")
-    absent = [
-        attribute
-        for attribute in ("stamp_ns", "points_cam", "descriptors_left")
-        if getattr(place, attribute, None) is None
-    ]
-    _require(not absent, f"{name} gives a place without {', '.join(absent)}")
-    n_bytes = sum(len(part) for part in _parts(place, _MAX_DEPTH))
-    _require(n_bytes <= _MAX_PLACE_BYTES, f"{name} gives a place of {1e-3 * n_bytes:.0f} kB")
-    return place
-
-
 def _check_agreement(name: str, difference: FloatArray, covariance: FloatArray) -> None:
+    """Check that a transform is the identity within its covariance."""
     twist = se3.log(difference)
     rotation, translation = np.linalg.norm(twist[:3]), np.linalg.norm(twist[3:])
     if rotation < _NEGLIGIBLE_RAD and translation < _NEGLIGIBLE_M:
@@ -272,20 +188,49 @@ def _check_agreement(name: str, difference: FloatArray, covariance: FloatArray) 
     )
 
 
-def _check_direction(frontend: Frontend[Any], frame: Stamped, following: Stamped) -> None:
+def _check_inverse(
+    frontend: Frontend[Any], forth: RelativePose, reference: Stamped, current: Stamped
+) -> None:
+    back = _find(frontend, current, reference)
+    covariance = se3.compose_covariance(forth.covariance, back.T_reference_current, back.covariance)
+    _check_agreement(
+        f"register({reference.stamp_ns}, {current.stamp_ns}) and the inverse of what it gives "
+        "the other way round",
+        forth.T_reference_current @ back.T_reference_current,
+        covariance,
+    )
+
+
+def _check_prior(
+    frontend: Frontend[Any], result: RelativePose, reference: Stamped, current: Stamped
+) -> None:
+    T, sigmas = result.T_reference_current, np.sqrt(np.diag(result.covariance))
+    T_wrong = T @ se3.exp(np.clip(_PRIOR_SIGMAS * sigmas, -_PRIOR_LIMITS, _PRIOR_LIMITS))
+    name = f"register({reference.stamp_ns}, {current.stamp_ns})"
+    for kind, prior in (
+        ("a prior", MotionPrior(T_predicted=T)),
+        ("a prior", MotionPrior(T_predicted=T_wrong)),
+        ("a recent median motion", MotionPrior(T_predicted=T, T_recent=T)),
+        ("a recent median motion", MotionPrior(T_predicted=T, T_recent=T_wrong)),
+    ):
+        guided = _register(frontend, reference, current, prior)
+        if isinstance(guided, Failure):
+            raise ContractError(f"{name} fails with {kind} and not without: {guided.reason}")
+        difference = se3.invert(T) @ guided.T_reference_current
+        covariance = result.covariance + guided.covariance
+        _check_agreement(f"{name} with and without {kind}", difference, covariance)
+
+
+def _check_direction(
+    frontend: Frontend[Any], frame: StereoFrame | RgbdFrame, stamp_ns: int
+) -> None:
     """Shift images to the left: the camera has turned, or moved, to the right."""
-    if not isinstance(frame, StereoFrame | RgbdFrame):
-        return
-    arrays = _images_of(frame)
     shifted: dict[str, Any] = {
-        name: np.concatenate(
-            [image[:, _SHIFT_PX:], np.repeat(image[:, -1:], _SHIFT_PX, axis=1)], axis=1
-        )
-        for name, image in arrays.items()
+        name: np.pad(image[:, _SHIFT_PX:], ((0, 0), (0, _SHIFT_PX)), mode="edge")
+        for name, image in _images_of(frame).items()
     }
-    # As long afterwards as the next frame: velocities play a role too.
-    turned = replace(frame, stamp_ns=following.stamp_ns + 1, **shifted)
-    result = _check_pair(frontend, frontend.extract(frame), frontend.extract(turned))
+    turned = replace(frame, stamp_ns=stamp_ns, **shifted)
+    result = _find(frontend, frontend.extract(frame), frontend.extract(turned))
     ahead = result.T_reference_current @ [0.0, 0.0, _SHIFT_DEPTH_M, 1.0]
     _require(
         ahead[0] > 0.0,
@@ -294,75 +239,83 @@ def _check_direction(frontend: Frontend[Any], frame: Stamped, following: Stamped
     )
 
 
-def _without_anything(first: Stamped, last: Stamped, blank: Stamped | None) -> list[Stamped]:
-    """Return frames that have nothing in common with any other."""
+def _images_of(frame: StereoFrame | RgbdFrame) -> dict[str, Any]:
+    names = ("left", "right") if isinstance(frame, StereoFrame) else ("image", "depth")
+    return {name: getattr(frame, name) for name in names}
+
+
+def _without_anything(first: Stamped, last_ns: int, blank: Stamped | None) -> list[Stamped]:
+    """Return frames that have nothing in common with any other: uniform ones, and noise."""
     frames = [] if blank is None else [blank]
     if not isinstance(first, StereoFrame | RgbdFrame):
         return frames
     rng = np.random.default_rng(0)
-    arrays = _images_of(first)
-    uniform: dict[str, Any] = {name: np.full_like(array, 100) for name, array in arrays.items()}
-    unknown = {"depth": np.full_like(arrays["depth"], np.nan)} if "depth" in arrays else {}
-    strange = {
-        name: rng.integers(0, 256, array.shape, dtype=np.uint8)
-        for name, array in arrays.items()
+    images = _images_of(first)
+    uniform: dict[str, Any] = {name: np.full_like(image, 100) for name, image in images.items()}
+    if "depth" in images:
+        uniform["depth"] = np.full_like(images["depth"], np.nan)
+    noise: dict[str, Any] = {
+        name: rng.integers(0, 256, image.shape, dtype=np.uint8)
+        for name, image in images.items()
         if name != "depth"
     }
-    contents = enumerate((uniform | unknown, strange), start=1)
-    return frames + [replace(first, stamp_ns=last.stamp_ns + n, **each) for n, each in contents]
+    contents = enumerate((uniform, noise), start=1)
+    return frames + [replace(first, stamp_ns=last_ns + n, **each) for n, each in contents]
 
 
-def _images_of(frame: StereoFrame | RgbdFrame) -> dict[str, Any]:
-    if isinstance(frame, StereoFrame):
-        return {"left": frame.left, "right": frame.right}
-    return {"image": frame.image, "depth": frame.depth}
+def _check_places(recognizer: Recognizer | None, seen: Stamped, frame: Stamped) -> None:
+    """Recognize a frame in its own place, and one without anything not."""
+    if recognizer is None:
+        return
+    name = f"recognize of the frame at {seen.stamp_ns} in its own place"
+    place, nothing = _place_of(recognizer, seen), recognizer.extract(frame)
+    result = recognizer.recognize(place, place, seen)
+    if isinstance(result, Failure):
+        raise ContractError(f"{name} fails: {result.reason}")
+    _require(not find_fault(result), f"{name}: {find_fault(result)}")
+    _check_agreement(name, result.T_reference_current, result.covariance)
+    result = recognizer.recognize(place, _place_of(recognizer, nothing), nothing)
+    stamps = f"{seen.stamp_ns}, {frame.stamp_ns}"
+    _require(
+        isinstance(result, Failure), f"frames without anything in common ({stamps}) are recognized"
+    )
 
 
-def _check_nothing_seen(frontend: Frontend[Any], observations: Stamped, frame: Stamped) -> None:
-    stamps = f"{observations.stamp_ns}, {frame.stamp_ns}"
-    for result in _register_nothing(frontend, observations, frame, stamps):
-        _require(
-            isinstance(result, Failure),
-            f"frames without anything in common ({stamps}) are registered",
-        )
-        _require(
-            isinstance(result, Failure) and bool(result.reason.strip()),
-            f"the Failure of frames without anything in common ({stamps}) gives no reason",
-        )
+def _place_of(recognizer: Recognizer, observations: Stamped) -> Any:  # noqa: ANN401
+    name = f"describe of the frame at {observations.stamp_ns}"
+    place, again = (recognizer.describe(observations) for _ in range(2))
+    _require(fingerprint(place) == fingerprint(again), f"{name} gives another place when repeated")
+    for attribute in ("stamp_ns", "points_cam", "descriptors_left"):
+        is_there = getattr(place, attribute, None) is not None
+        _require(is_there, f"{name} gives a place without {attribute}")
+    n_bytes = sum(len(part) for part in _parts(place, _MAX_DEPTH))
+    _require(n_bytes <= _MAX_PLACE_BYTES, f"{name} gives a place of {1e-3 * n_bytes:.0f} kB")
+    return place
 
 
-def _register_nothing(
-    frontend: Frontend[Any], observations: Stamped, frame: Stamped, stamps: str
-) -> list[RelativePose | Failure]:
+def _check_nothing_seen(frontend: Frontend[Any], seen: Stamped, frame: Stamped) -> None:
+    name = f"frames without anything in common ({seen.stamp_ns}, {frame.stamp_ns})"
     still = np.eye(4)
-    expected = MotionPrior(T_predicted=still), MotionPrior(T_predicted=still, T_recent=still)
+    priors = None, MotionPrior(T_predicted=still), MotionPrior(T_predicted=still, T_recent=still)
     try:
         nothing = frontend.extract(frame)
-        return [
-            _register(frontend, reference, current, prior)
-            for reference, current in ((observations, nothing), (nothing, observations))
-            for prior in (None, *expected)
-        ]
+        pairs = (seen, nothing), (nothing, seen)
+        results = [_register(frontend, a, b, prior) for a, b in pairs for prior in priors]
     except ContractError:
         raise
     except Exception as error:  # whatever it is, it is the breach that is looked for
         raise ContractError(
-            f"frames without anything in common ({stamps}) raise {type(error).__name__}: {error}; "
-            "a Failure is expected"
+            f"{name} raise {type(error).__name__}: {error}; a Failure is expected"
         ) from error
+    for result in results:
+        if not isinstance(result, Failure):
+            raise ContractError(f"{name} are registered")
+        _require(bool(result.reason.strip()), f"the Failure of {name} gives no reason")
 
 
 def fingerprint(value: object) -> str:
-    """Return a digest of all arrays and plain values that a value holds.
-
-    Looks into dataclasses, objects, mappings and sequences, six levels deep; what is none of
-    these and no plain value counts by its type alone.
-    """
-    digest = hashlib.blake2b(digest_size=16)
-    for part in _parts(value, _MAX_DEPTH):
-        digest.update(part)
-        digest.update(b"|")
-    return digest.hexdigest()
+    """Return a digest of all arrays and plain values that a value holds, six levels deep."""
+    return hashlib.blake2b(b"|".join(_parts(value, _MAX_DEPTH))).hexdigest()
 
 
 def _parts(value: object, depth: int) -> Iterator[bytes]:
@@ -386,4 +339,4 @@ def _members(value: object) -> Iterator[tuple[str, object]]:
     elif isinstance(value, list | tuple):
         yield from ((str(index), member) for index, member in enumerate(value))
     else:
-        yield from vars(value).items() if hasattr(value, "__dict__") else ()
+        yield from getattr(value, "__dict__", {}).items()

@@ -17,7 +17,7 @@ from gvo.geometry.camera import Calibration, stereo_camera
 from gvo.geometry.lens import DistortionModel
 from gvo.io.convert.convert import convert
 from gvo.io.recording import Sensor, Source
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, FaultyFrame, FloatArray, RgbdFrame, StereoFrame
 from tests.recordings import Held, hold

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from itertools import chain
 from typing import Any
 
@@ -11,9 +11,10 @@ import pytest
 
 from gvo import Config, FrameResult, Odometry, SyntheticRecording, frames
 from gvo.geometry import se3
-from gvo.io.synthetic.worlds.deceptive import bus_path
 from gvo.types import FloatArray, RgbdFrame, Status, StereoFrame
 from tests.recordings import Held
+from tests.worlds import KINDS
+from tests.worlds.deceptive import traffic
 
 pytestmark = pytest.mark.acceptance
 
@@ -51,15 +52,11 @@ def rendered(
     world: Any, sensor: Any, n_frames: int, scale: float, *, seed: int = 0, speed: float = 1.0
 ) -> Held:
     """Return a recording whose images are rendered once, with a bus so many times as fast."""
-    recording = SyntheticRecording(world, sensor, n_frames=n_frames, scale=scale, seed=seed)
-
-    def path(elapsed_s: float) -> FloatArray:
-        T_map_body = bus_path(elapsed_s).copy()
-        T_map_body[0, 3] *= speed
-        return T_map_body
-
     if world == "traffic":
-        recording._moving_scene = replace(recording._moving_scene, path=path)
+        world = replace(KINDS[world], scene=partial(traffic, speed=speed))
+    else:
+        world = KINDS[world]
+    recording = SyntheticRecording(world, sensor, n_frames=n_frames, scale=scale, seed=seed)
     items = [replace(image, load=cache(image.load)) for image in recording.images()]
     return Held(info=recording.info, items=items, truth=recording.ground_truth())
 

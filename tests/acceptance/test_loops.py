@@ -9,7 +9,7 @@ import pytest
 
 import gvo
 from gvo.geometry import se3
-from gvo.testing.faults import Black, FaultySource
+from gvo.testing import Black, FaultySource
 from gvo.trajectory.g2o import format_edge
 from tests.acceptance.conftest import SCRIPTS, Script
 from tests.conftest import python, run_of

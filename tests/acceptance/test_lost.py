@@ -7,8 +7,9 @@ import pytest
 
 import gvo
 from gvo.io.recording import Source
-from gvo.testing.faults import Black, FaultySource
+from gvo.testing import Black, FaultySource
 from gvo.types import FaultyFrame, FrameResult, Status
+from tests.worlds import rendered
 
 pytestmark = pytest.mark.acceptance
 
@@ -60,7 +61,7 @@ def test_a_camera_that_was_lost_in_a_room_finds_its_place() -> None:
 
 
 def test_windows_that_repeat_connect_nothing_across_the_dark() -> None:
-    facade = gvo.SyntheticRecording("facade", n_frames=75, seed=0, scale=0.5)
+    facade = rendered("facade", n_frames=75, seed=0, scale=0.5)
     odometry, results = follow(FaultySource(facade, Black(first=30, end=50)))
     assert not any(result.joins for result in results)
     loops = odometry.optimize().loops
@@ -69,7 +70,7 @@ def test_windows_that_repeat_connect_nothing_across_the_dark() -> None:
 
 
 def test_equal_rooms_are_not_taken_for_each_other() -> None:
-    rooms = gvo.SyntheticRecording("rooms", "rgbd", n_frames=450, seed=1, scale=0.5)
+    rooms = rendered("rooms", "rgbd", n_frames=450, seed=1, scale=0.5)
     odometry, _ = follow(rooms)
     loops = odometry.optimize().loops
     assert len(loops) > 3

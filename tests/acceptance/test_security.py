@@ -15,7 +15,7 @@ import pytest
 import gvo
 from gvo.io.convert.convert import convert
 from gvo.io.recording import RecordingInfo
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 
 pytestmark = pytest.mark.acceptance
 

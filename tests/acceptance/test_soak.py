@@ -51,11 +51,9 @@ MAX_GROWTH_OBJECTS = 80 * N_THIRD
 
 @pytest.fixture(scope="module")
 def drive() -> Any:
-    """Return the script's names, and its drive made to go back and forth over a few frames."""
-    script = runpy.run_path(str(SOAK))
-    poses = script["lap_poses"](500)[:N_LAP]
-    there_and_back = np.concatenate([poses, poses[-2:0:-1]])
-    return script["EndlessDrive"](3 * N_THIRD + N_BEYOND, T_map_cam=there_and_back)
+    """Return the script's drive, back and forth over a few frames."""
+    order = [*range(N_LAP), *range(N_LAP - 2, 0, -1)]
+    return runpy.run_path(str(SOAK))["EndlessDrive"](3 * N_THIRD + N_BEYOND, order)
 
 
 class Memory:
@@ -109,12 +107,7 @@ def test_kept_frames_are_seen(drive: Any, tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_the_lap_of_the_soak_closes() -> None:
-    n = 50
-    poses = runpy.run_path(str(SOAK))["lap_poses"](n)
+    poses = runpy.run_path(str(SOAK))["lap"](np.arange(500) / 10.0)
     steps = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0, append=poses[:1, :2, 3]), axis=1)
-    # Chords of a road of LAP_M, all of the same length but where it turns: the last one, too.
-    assert steps.max() <= LAP_M / n + 1e-9
-    assert steps.min() > 0.97 * LAP_M / n
-    turns = np.einsum("nij,nij->n", poses[:, :3, :3], np.roll(poses[:, :3, :3], -1, axis=0))
-    assert np.all(turns > 2.0)
-    np.testing.assert_allclose(poses[:, :3, :3] @ poses[:, :3, :3].mT, [np.eye(3)] * n, atol=1e-12)
+    assert steps.max() <= LAP_M / 500 + 1e-9
+    assert steps.min() > 0.97 * LAP_M / 500

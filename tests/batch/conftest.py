@@ -19,7 +19,7 @@ from distributed import Client, LocalCluster
 
 import gvo
 from gvo.batch import BatchOptions
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from tests.conftest import GVO
 from tests.recordings import Held, hold
 

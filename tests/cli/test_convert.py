@@ -12,7 +12,7 @@ import gvo
 from gvo.geometry.se3 import make_transform
 from gvo.io.convert.convert import convert, write_folder
 from gvo.io.recording import StampedImage
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from gvo.trajectory.formats import read_trajectory
 from tests.conftest import Command, assert_same_files, refused, run_of
 from tests.io.conftest import Item, ListSource, Tiny

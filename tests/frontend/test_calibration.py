@@ -32,7 +32,7 @@ from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.refinement import Adjustment
 from gvo.io.recording import Sensor
-from gvo.io.synthetic.recording import SensorNoise
+from gvo.io.synthetic import SensorNoise
 from gvo.types import (
     ConstantError,
     Failure,

@@ -13,7 +13,7 @@ from gvo.frontend.depth_icp import DepthAligner, DepthMap, DepthTrust, align_dep
 from gvo.frontend.descriptor import as_stereo
 from gvo.geometry import se3
 from gvo.io.recording import StampedImage
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from gvo.types import DepthArray, Failure, FloatArray, RelativePose, RgbdFrame
 
 N_FRAMES = 40

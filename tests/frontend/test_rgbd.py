@@ -15,7 +15,7 @@ from gvo.frontend.rgbd import (
     sample_depth,
 )
 from gvo.geometry import se3
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from gvo.types import Contradiction, DepthArray, FloatArray, RelativePose
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)

@@ -15,7 +15,7 @@ from gvo.geometry.camera import Calibration, PinholeCamera, rectification_maps
 from gvo.geometry.se3 import invert, make_transform
 from gvo.io.depth_registration import DepthRegistration
 from gvo.io.recording import DepthView
-from gvo.io.synthetic.rendering import render_depth
+from gvo.io.synthetic.rendering import StillScene
 from gvo.io.synthetic.worlds.motion import look_around
 from gvo.io.synthetic.worlds.room import room
 from gvo.types import DepthArray, FloatArray
@@ -54,8 +54,9 @@ def test_registered_depth_is_what_the_colour_camera_would_measure(
 ) -> None:
     T_map_color = look_around(np.array([1.0]))[0]
     T_color_depth = make_transform(_TURN, np.array(t))
-    truth = render_depth(room(0), T_map_color, _COLOR)
-    depth = render_depth(room(0), T_map_color @ T_color_depth, camera)
+    scene = StillScene(room(0))
+    truth = scene.depth(0.0, T_map_color, _COLOR)
+    depth = scene.depth(0.0, T_map_color @ T_color_depth, camera)
     registered = _registration(camera, T_color_depth)(depth)
     assert registered.dtype == np.float32
 

@@ -16,7 +16,7 @@ from gvo.frontend.descriptor import DescriptorFrontend
 from gvo.frontend.klt import KltFrontend
 from gvo.io.frames import frames
 from gvo.io.recording import Sensor
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from gvo.odometry.odometry import Odometry
 from gvo.types import Estimate, Frame, FrameResult, RgbdFrame, StereoFrame
 

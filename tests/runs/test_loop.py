@@ -15,7 +15,7 @@ from gvo.geometry import se3
 from gvo.io.excerpt import Excerpt
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import Sensor
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from gvo.odometry.odometry import Odometry
 from gvo.runs.loop import RunLoop, edge_over
 from gvo.types import Edge, Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Optimum, Progress

@@ -15,15 +15,15 @@ import gvo
 from gvo.errors import RecordingError, SmoothingError, TrajectoryError
 from gvo.geometry import se3
 from gvo.io.poses.inputs import find_base_frame, read_truth
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from gvo.odometry.odometry import Odometry
 from gvo.runs.loop import Output, RunLoop
 from gvo.runs.outputs.bag import RunBag
-from gvo.testing import faults as made
-from gvo.testing.faults import FaultySource
+from gvo.testing import FaultySource
 from gvo.trajectory.formats import read_covariances, write_kitti
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Optimum, Progress
+from tests import faults as made
 from tests.conftest import Command, run_of
 from tests.io.pose_bags import PoseBag
 from tests.rendered_walk import (

@@ -16,7 +16,7 @@ from gvo.geometry.se3 import make_transform
 from gvo.io.excerpt import Excerpt
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import StampedImage
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from gvo.runs.summary import run_identity
 from gvo.trajectory.trajectory import Trajectory
 

@@ -20,7 +20,6 @@ from gvo.types import BoolArray, DepthArray, FloatArray, ImageArray, IntArray
 
 SampleArray: TypeAlias = NDArray[np.float32]
 IndexArray: TypeAlias = NDArray[np.int16]
-Plane: TypeAlias = tuple[FloatArray, FloatArray]
 _Box: TypeAlias = tuple[slice, slice]
 _Pixels: TypeAlias = tuple[IntArray, IntArray]
 _Span: TypeAlias = tuple[IndexArray, IndexArray]
@@ -32,27 +31,23 @@ _BAND_SAMPLES = 24_000  # samples shaded at once: their temporaries stay in the 
 _CULLED_ROWS = 8  # what is in view is found out from the poses of every eighth row
 
 
-def render_image(
-    scene: Scene, T_map_cam: FloatArray, camera: PinholeCamera, *, beyond: Plane | None = None
-) -> SampleArray:
-    """Render a grey image without noise, by four samples for the pixels where surfaces meet.
+@dataclass(frozen=True, slots=True)
+class StillScene:
+    """A scene in which nothing moves, as a `Scenery`."""
 
-    Parameters
-    ----------
-    scene : Scene
-        Rectangles in the `map` frame, metres.
-    T_map_cam : ndarray of float64, shape (4, 4) or (height, 4, 4)
-        Maps camera coordinates to the map, metres; of the image or of each of its rows.
-    camera : PinholeCamera
-    beyond : (ndarray of float64, ndarray of float64), optional
-        Point and normal of a plane that cuts away what is before it, see `look`.
+    scene: Scene
 
-    Returns
-    -------
-    ndarray of float32, shape (height, width)
-        Grey values, 0 to 255 where the light does not exceed the texture's.
-    """
-    view = look(scene, T_map_cam, camera, beyond=beyond)
+    def image(self, elapsed_s: float, T_map_cam: FloatArray, camera: PinholeCamera) -> SampleArray:
+        """Render grey values, the same at any time."""
+        return render_image(look(self.scene, T_map_cam, camera))
+
+    def depth(self, elapsed_s: float, T_map_cam: FloatArray, camera: PinholeCamera) -> DepthArray:
+        """Render depth, the same at any time."""
+        return render_depth(look(self.scene, T_map_cam, camera))
+
+
+def render_image(view: View) -> SampleArray:
+    """Render a grey image without noise, by four samples for the pixels where surfaces meet."""
     fine = find_visible(refine(view))
     corners = [np.ascontiguousarray(fine[i::2, j::2]) for i in (0, 1) for j in (0, 1)]
     image = shade_rows(view, corners[0])
@@ -66,27 +61,9 @@ def render_image(
     return image
 
 
-def render_depth(
-    scene: Scene, T_map_cam: FloatArray, camera: PinholeCamera, *, beyond: Plane | None = None
-) -> DepthArray:
-    """Render the exact depth at the centre of each pixel.
-
-    Parameters
-    ----------
-    scene : Scene
-        Rectangles in the `map` frame, metres.
-    T_map_cam : ndarray of float64, shape (4, 4) or (height, 4, 4)
-        Maps camera coordinates to the map, metres; of the image or of each of its rows.
-    camera : PinholeCamera
-    beyond : (ndarray of float64, ndarray of float64), optional
-        Point and normal of a plane that cuts away what is before it, see `look`.
-
-    Returns
-    -------
-    ndarray of float32, shape (height, width)
-        Metres along the optical axis (of the row's pose), NaN where there is nothing.
-    """
-    view = look(scene, T_map_cam, camera, beyond=beyond)
+def render_depth(view: View) -> DepthArray:
+    """Render the exact depth (m) at the centre of each pixel; NaN where there is nothing."""
+    camera = view.camera
     u, v = np.arange(camera.width), np.arange(camera.height)[:, np.newaxis]
     nothing = np.full((*view.inverse_depth.shape[:-2], 1, 3), np.nan)
     forms = np.concatenate([view.inverse_depth, nothing], axis=-2)  # where visible is -1
@@ -96,18 +73,7 @@ def render_depth(
 
 
 def to_uint8(grey: SampleArray) -> ImageArray:
-    """Round and clip grey values.
-
-    Parameters
-    ----------
-    grey : ndarray of float32, shape (h, w)
-        Any values.
-
-    Returns
-    -------
-    ndarray of uint8, shape (h, w)
-        0 to 255.
-    """
+    """Round and clip grey values."""
     return np.asarray(cv2.convertScaleAbs(np.maximum(grey, 0.0)), dtype=np.uint8)
 
 
@@ -127,8 +93,8 @@ class View:
         1/z in 1/m.
     texels_s, texels_t : ndarray of float64, shape (n, 3) or (height, n, 3)
         Texture coordinates over z, texels per metre.
-    inside : ndarray of float64, shape (n, 4 or 5, 3) or (height, n, 4 or 5, 3)
-        All not negative inside of the rectangle, and beyond the plane that cuts the view.
+    inside : ndarray of float64, shape (n, m, 3) or (height, n, m, 3)
+        All m forms (one for each side) are not negative inside of the rectangle.
     corners : ndarray of float64, shape (n, 4, 3)
         In the camera frame, of the middle row, metres.
     """
@@ -152,41 +118,16 @@ class View:
         return forms[self.camera.height // 2] if self.is_rolling else forms
 
     def along_rows(self, forms: FloatArray, k: int, rows: IntArray) -> tuple[FloatArray, ...]:
-        """Return slopes along u, (1 or n_rows), and values at u = 0, (n_rows).
-
-        Parameters
-        ----------
-        forms : ndarray of float64
-            One of those of the view.
-        k : int
-            The rectangle.
-        rows : ndarray of int64, shape (n_rows,)
-        """
+        """Return slopes along u, (1 or n_rows), and values at u = 0, (n_rows), of rectangle k."""
         a, b, c = forms[rows, k].T if self.is_rolling else forms[k, :, np.newaxis]
         return a, b * rows + c
 
 
-def look(
-    scene: Scene, T_map_cam: FloatArray, camera: PinholeCamera, *, beyond: Plane | None = None
-) -> View:
+def look(scene: Scene, T_map_cam: FloatArray, camera: PinholeCamera) -> View:
     """Keep the rectangles in view and express them as linear forms of the pixel.
 
-    Parameters
-    ----------
-    scene : Scene
-        In the map frame, metres.
-    T_map_cam : ndarray of float64, shape (4, 4) or (height, 4, 4)
-        Maps camera coordinates to the map, metres; of the image or of each of its rows.
-    camera : PinholeCamera
-        Of the image.
-    beyond : (ndarray of float64, ndarray of float64), optional
-        Point and normal of a plane, `map` frame: only what lies on the side that the normal
-        points to is seen.
-
-    Returns
-    -------
-    View
-        What the camera may see.
+    `T_map_cam` maps camera coordinates to the map: shape (4, 4), or (height, 4, 4) with a pose
+    for each row.
     """
     T_cam_map, K_inverse = invert(T_map_cam), np.linalg.inv(camera.K)
     keep = _in_view(scene, T_cam_map, camera)
@@ -202,10 +143,6 @@ def look(
     )
     width, height = scene.sizes[keep].T[..., np.newaxis]
     inside = [s, width * inverse_depth - s, t, height * inverse_depth - t]
-    if beyond is not None:
-        point, normal = R @ beyond[0] + T_cam_map[..., :3, 3], R @ beyond[1]
-        offset = _dots(normal, point)[..., np.newaxis, np.newaxis]
-        inside.append((normal @ K_inverse)[..., np.newaxis, :] - offset * inverse_depth)
     T_middle = T_cam_map if T_cam_map.ndim == 2 else np.asarray(T_cam_map[len(T_cam_map) // 2])
     return View(
         scene=scene,
@@ -262,18 +199,7 @@ def _dots(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def refine(view: View) -> View:
-    """Return the view of an image of twice the width and height.
-
-    Parameters
-    ----------
-    view : View
-        From the same pose.
-
-    Returns
-    -------
-    View
-        Its linear forms take pixels of the larger image, of which two rows share a pose.
-    """
+    """Return the view of an image of twice the width and height; two rows share a pose."""
     M = np.array([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]])
 
     def refined(forms: FloatArray) -> FloatArray:
@@ -302,18 +228,7 @@ def scale_camera(camera: PinholeCamera, scale: float) -> PinholeCamera:
 
 
 def find_visible(view: View) -> IndexArray:
-    """Return the nearest rectangle at each pixel.
-
-    Parameters
-    ----------
-    view : View
-        Of h x w pixels.
-
-    Returns
-    -------
-    ndarray of int16, shape (h, w)
-        Index into the view; -1: nothing.
-    """
+    """Return the index (in the view) of the nearest rectangle at each pixel; -1: nothing."""
     nearest = np.zeros((view.camera.height, view.camera.width), dtype=np.float32)
     visible = np.full(nearest.shape, NOTHING, dtype=np.int16)
     spans = _row_spans(view)

@@ -65,7 +65,7 @@ class Player(AbstractContextManager["Player"]):
 
     Examples
     --------
-    >>> from gvo.io.synthetic.recording import SyntheticRecording
+    >>> from gvo.io.synthetic import SyntheticRecording
     >>> recording = SyntheticRecording("handheld", "rgbd", n_frames=3, scale=0.25)
     >>> with Player(lambda config: recording, Config()) as player:
     ...     player.seek(2)

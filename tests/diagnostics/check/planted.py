@@ -10,7 +10,7 @@ from typing import Any
 from gvo.config import Config
 from gvo.diagnostics.check import CheckResult, Finding, check_recording
 from gvo.io.recording import Sensor, Source
-from gvo.io.synthetic.recording import SyntheticRecording, WorldName
+from gvo.io.synthetic import SyntheticRecording, WorldName
 from tests.recordings import Held, hold
 
 N_FRAMES = 40

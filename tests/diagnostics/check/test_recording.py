@@ -17,8 +17,8 @@ from gvo.config import Config
 from gvo.diagnostics.check import check_recording
 from gvo.io.bag.source import BagSource
 from gvo.io.opening import open_recording
-from gvo.testing import faults as made
-from gvo.testing.faults import FaultySource
+from gvo.testing import FaultySource
+from tests import faults as made
 from tests.diagnostics.check.planted import check, complaints, find, render
 from tests.recordings import Held
 

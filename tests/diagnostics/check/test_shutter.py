@@ -10,7 +10,7 @@ from gvo.config import Config
 from gvo.diagnostics.check import Finding, check_recording
 from gvo.errors import RecordingError
 from gvo.io.recording import Sensor, StampedImage
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from tests.diagnostics.check.planted import N_FRAMES, render
 from tests.recordings import Held
 

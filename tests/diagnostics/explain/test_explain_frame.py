@@ -18,7 +18,7 @@ from gvo.errors import GvoError
 from gvo.geometry import se3
 from gvo.io.frames import frames
 from gvo.io.recording import Sensor, Source, StampedImage
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from gvo.odometry.keyframes import Keyframes
 from gvo.odometry.odometry import Odometry
 from gvo.types import FaultyFrame, FrameResult, Progress

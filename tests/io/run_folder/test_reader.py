@@ -10,7 +10,7 @@ import pytest
 
 from gvo.errors import GvoError, RecordingError, TrajectoryError
 from gvo.io.run_folder.reader import RunRecord, read_run
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from gvo.runs.run import run_recording
 from gvo.trajectory.formats import read_covariances, read_trajectory
 

@@ -22,7 +22,7 @@ from gvo.geometry.se3 import make_transform
 from gvo.io.convert.bag_messages import BagWriter
 from gvo.io.poses.tf import TfBuffer
 from gvo.io.recording import Sensor
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from gvo.odometry.odometry import Odometry
 from gvo.runs.outputs.bag import N_SHOWN_POSES, RunBag
 from gvo.runs.outputs.frames import RunFrames

@@ -29,7 +29,7 @@ from gvo.geometry.camera import StereoCamera
 from gvo.geometry.se3 import exp, make_transform
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.run_folder.writer import RunFolder
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from gvo.runs.loop import RunLoop
 from gvo.runs.outputs import rerun_writer as rerun_run
 from gvo.runs.outputs.frames import RunFrames

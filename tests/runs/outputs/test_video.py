@@ -13,7 +13,7 @@ from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.io.frames import frames
 from gvo.io.recording import Sensor
-from gvo.io.synthetic.recording import SyntheticRecording, WorldName
+from gvo.io.synthetic import SyntheticRecording, WorldName
 from gvo.odometry.odometry import Odometry
 from gvo.runs.outputs.video import RunOverlay, film_width
 from gvo.types import FaultyFrame, Frame, FrameResult, ImageArray

@@ -18,7 +18,7 @@ from gvo.config import Config, RegistrationConfig, load_configuration
 from gvo.diagnostics.explain import FrameExplanation, explain_frame
 from gvo.errors import ConfigurationError
 from gvo.io.recording import Sensor
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from gvo.viz.explanation import write_explanation
 from gvo.viz.explanation.motion import draw_residuals, position_covariance
 from gvo.viz.explanation.sheet import TITLES, Sheet

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from gvo.errors import ConfigurationError
 from gvo.geometry import se3
 from gvo.io.run_folder.reader import read_run
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from gvo.trajectory.evaluation import Consistency, evaluate
 from gvo.trajectory.formats import write_covariances, write_tum
 from gvo.trajectory.trajectory import Trajectory

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from gvo.io.run_folder.reader import read_run
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from gvo.viz.report import write_run_report
 from tests.conftest import run_of
 from tests.runs.outputs.long_run import make_long_run

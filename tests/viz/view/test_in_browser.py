@@ -7,7 +7,7 @@ import pytest
 
 import gvo
 from gvo.config import Config, load_configuration
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from gvo.viz.view import serve
 from gvo.viz.view.player import Player
 from tests.conftest import run_of

@@ -13,7 +13,7 @@ from hypothesis.extra.numpy import arrays
 
 from gvo.config import Config, load_configuration
 from gvo.geometry import se3
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
 from gvo.viz.view import serve

@@ -13,7 +13,7 @@ from gvo.errors import RecordingError
 from gvo.io.excerpt import Excerpt
 from gvo.io.frames import frames
 from gvo.io.recording import RecordingInfo, Source, StampedImage
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from gvo.odometry.odometry import Odometry
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, FrameResult, RgbdFrame

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from gvo.geometry.se3 import exp, make_transform
 from gvo.io.synthetic import textures as paint
-from gvo.io.synthetic.moving_scene import MovingScene
 from gvo.io.synthetic.scene import Rectangle, Scene, make_scene
 from gvo.io.synthetic.textures import Texture
 from gvo.io.synthetic.worlds import motion
@@ -20,6 +19,7 @@ from gvo.io.synthetic.worlds.room import LAMP, room_rectangles, room_textures
 from gvo.io.synthetic.worlds.street import DAYLIGHT, street_rectangles
 from gvo.io.synthetic.worlds.street_textures import street_textures
 from gvo.types import FloatArray
+from tests.worlds.moving import MirrorScene, MovingScene
 
 _BUS_M = (18.0, 2.55, 3.0)  # length, width, height
 _BOTTOM_M = 0.3
@@ -63,13 +63,7 @@ _WALK_S = 16.0
 
 
 def traffic_drive(stamps_s: FloatArray) -> FloatArray:
-    """Return T_map_cam, shape (n, 4, 4), of a car that brakes, stands for 7 s and drives on.
-
-    Parameters
-    ----------
-    stamps_s : ndarray of float64, shape (n,)
-        Seconds since the start.
-    """
+    """Return T_map_cam, shape (n, 4, 4), of a car that brakes, stands for 7 s and drives on."""
     t = stamps_s
     left_s = np.maximum(_HALT_S - t, 0.0)
     gone_s = np.maximum(t - _START_S, 0.0)
@@ -81,21 +75,23 @@ def traffic_drive(stamps_s: FloatArray) -> FloatArray:
     return motion.drive_along(t, s, shake=np.minimum(speeds / _SPEED_M_S, 1.0))
 
 
-def bus_path(elapsed_s: float) -> FloatArray:
+def bus_path(elapsed_s: float, *, speed: float = 1.0) -> FloatArray:
     """Return T_map_body of the bus: it comes from the left, halts at 5.5 s, pulls off at 6.5 s."""
     coming_s = max(5.5 - elapsed_s, 0.0)
     gone_s = max(elapsed_s - 6.5, 0.0)
-    x = -0.5 * 2.6 * coming_s**2 + 0.5 * 1.2 * gone_s**2
+    x = (-0.5 * 2.6 * coming_s**2 + 0.5 * 1.2 * gone_s**2) * speed
     return np.asarray(make_transform(np.eye(3), np.array([x, _CROSSING_M, 0.0])))
 
 
 @lru_cache(maxsize=2)
-def traffic(seed: int) -> MovingScene:
-    """Build the street with a gap for the crossing, and the bus."""
+def traffic(seed: int, speed: float = 1.0) -> MovingScene:
+    """Build the street with a gap for the crossing, and a bus so many times as fast."""
     still = [*filter(_leaves_way, street_rectangles(seed))]
     textures = street_textures(seed) | {"bus": _bus_side(np.random.default_rng([seed, 4]))}
     return MovingScene(
-        scene=make_scene([*still, *_bus()], textures, DAYLIGHT), n_still=len(still), path=bus_path
+        scene=make_scene([*still, *_bus()], textures, DAYLIGHT),
+        n_still=len(still),
+        path=partial(bus_path, speed=speed),
     )
 
 
@@ -147,11 +143,6 @@ def ride(stamps_s: FloatArray) -> FloatArray:
 
     At 10 Hz it moves by more than half a window from frame to frame: whoever looks for the
     nearest equal window sees it ride backwards.
-
-    Parameters
-    ----------
-    stamps_s : ndarray of float64, shape (n,)
-        Seconds since the start.
     """
     t = stamps_s
     rising_s = np.minimum(t, _FACADE_SPEED_M_S / _ACCELERATION_M_S2)
@@ -212,7 +203,7 @@ def _window(rng: np.random.Generator) -> Texture:
 
 
 @lru_cache(maxsize=2)
-def mirror_room(seed: int) -> MovingScene:
+def mirror_room(seed: int, is_dusty: bool) -> MirrorScene:
     """Build the room with a standing mirror that swings about its upright axis."""
     still = room_rectangles()
     width, height = _MIRROR_M
@@ -225,12 +216,9 @@ def mirror_room(seed: int) -> MovingScene:
         *box(np.array([half + 0.03, 0.03]), 0.0, (0.04, 0.06, height), plain("wood")),
     ]
     textures = room_textures(seed) | {"black": paint.finish(paint.blank(0), (1.0, 1.0))}
-    return MovingScene(
-        scene=make_scene([*still, glass, *frame], textures, LAMP),
-        n_still=len(still),
-        path=_swing,
-        mirror=len(still),
-    )
+    scene = make_scene([*still, glass, *frame], textures, LAMP)
+    moving = MovingScene(scene=scene, n_still=len(still), path=_swing)
+    return MirrorScene(moving=moving, is_dusty=is_dusty)
 
 
 def _swing(elapsed_s: float) -> FloatArray:
@@ -242,23 +230,15 @@ def _swing(elapsed_s: float) -> FloatArray:
 
 
 @lru_cache(maxsize=2)
-def blank_room(seed: int) -> MovingScene:
+def blank_room(seed: int) -> Scene:
     """Build the room with a wall of one grey behind the camera, from floor to ceiling."""
     blank: Texture = paint.finish(paint.blank(190), (1.0, 1.0))
     board = wall(np.array([2.0, -1.97]), np.array([-2.0, -1.97]), (0.0, 2.5), stretched("blank"))
-    return MovingScene(
-        scene=make_scene([*room_rectangles(), board], room_textures(seed) | {"blank": blank}, LAMP)
-    )
+    return make_scene([*room_rectangles(), board], room_textures(seed) | {"blank": blank}, LAMP)
 
 
 def turn_away(stamps_s: FloatArray) -> FloatArray:
-    """Return T_map_cam, shape (n, 4, 4), of a hand that turns to the wall behind it, and back.
-
-    Parameters
-    ----------
-    stamps_s : ndarray of float64, shape (n,)
-        Seconds since the start; the wall fills the view from 3.8 s to 7.0 s.
-    """
+    """Return T_map_cam, shape (n, 4, 4), of a hand that turns to the wall behind it, and back."""
     start, duration = _AWAY_S
     away = _smooth((stamps_s - start) / duration)
     back = _smooth((stamps_s - start - duration - _BLANK_S) / duration)
@@ -276,14 +256,7 @@ def _smooth(share: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=2)
 def rooms(seed: int) -> Scene:
-    """Build three rooms furnished alike, their doors on one corridor.
-
-    Returns
-    -------
-    Scene
-        Some 800 rectangles, map axes with z up; the first room as `room` has it, the others to
-        the right of it.
-    """
+    """Build three rooms furnished alike, their doors on one corridor."""
     return make_scene(rooms_rectangles(), room_textures(seed), LAMP)
 
 
@@ -348,13 +321,6 @@ def walk(seed: int, stamps_s: FloatArray) -> FloatArray:
     """Return T_map_cam, shape (n, 4, 4), of a camera carried in the hand from room to room.
 
     It looks around in a room for 4 s, leaves by the door, and is in the next one 16 s later.
-
-    Parameters
-    ----------
-    seed : int
-        Of how the hand sways.
-    stamps_s : ndarray of float64, shape (n,)
-        Seconds since the start.
     """
     onwards = np.array([_WALK_S, _APART_M, 0.0, 0.0])
     knots = np.vstack([_WALK + k * onwards for k in range(_N_ROOMS)])[

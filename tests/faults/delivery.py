@@ -1,4 +1,4 @@
-"""Faults of delivery and stamps: images lost, repeated, late, out of step; wrong clocks."""
+"""Faults of delivery, stamps and calibration."""
 
 from __future__ import annotations
 
@@ -10,20 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gvo.errors import RecordingError
+from gvo.geometry.camera import Calibration
 from gvo.io.recording import RecordingInfo, Source
-from gvo.testing.faults.fault import Fault, FaultyImage, ImageFault, Pixels
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Dropped(Fault):
-    """Missing images: lost on the way, or never taken.
-
-    Without parameters none is left; with `first`, the recording ends early.
-    """
-
-    def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
-        """Yield the images that are not affected."""
-        return (image for image in images if not self.applies_to(image))
+from gvo.testing.faults import Fault, FaultyImage, Pixels
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,7 +20,6 @@ class Repeated(Fault):
     """Images that are delivered twice, with the same stamp."""
 
     def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
-        """Yield all images, affected ones twice."""
         for image in images:
             yield image
             if self.applies_to(image):
@@ -43,7 +31,6 @@ class Frozen(Fault):
     """A camera that hangs: the last image before, again and again, with new stamps."""
 
     def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
-        """Yield all images; affected ones show the last one before that is not."""
         last: dict[int, FaultyImage] = {}
         for image in images:
             stream = image.given.stream
@@ -56,24 +43,11 @@ class Frozen(Fault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Late(Fault):
-    """Images that are delivered late, with the right stamps.
-
-    Parameters
-    ----------
-    by : int
-        Number of images of the same stream that come before.
-    """
+    """Images that are delivered late, with the right stamps."""
 
     by: int = 1
 
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        Fault.__post_init__(self)
-        if self.by < 1:
-            raise ValueError(f"by must be 1 or more, got {self.by}")
-
     def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
-        """Yield all images, affected ones later."""
         waiting: list[FaultyImage] = []
         for image in images:
             if self.applies_to(image):
@@ -91,18 +65,11 @@ class Late(Fault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shuffled(Fault):
-    """Images in a random order, with the right stamps.
-
-    Parameters
-    ----------
-    within : int
-        Number of consecutive affected images of each stream that change places.
-    """
+    """Images in a random order, with the right stamps."""
 
     within: int = 4
 
     def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
-        """Yield all images, affected ones in another order."""
         held: list[FaultyImage] = []
         for image in images:
             is_affected = self.applies_to(image)
@@ -123,18 +90,11 @@ class Shuffled(Fault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lagging(Fault):
-    """Images that show an earlier frame; the first ones show the first frame.
-
-    Parameters
-    ----------
-    by : int
-        Frames.
-    """
+    """Images that show an earlier frame; the first ones show the first frame."""
 
     by: int = 1
 
     def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
-        """Yield all images; affected ones show an earlier one."""
         earlier: tuple[deque[FaultyImage], ...] = tuple(deque(maxlen=self.by + 1) for _ in range(2))
         for image in images:
             past = earlier[image.given.stream]
@@ -144,13 +104,9 @@ class Lagging(Fault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Exchanged(Fault):
-    """Left and right exchanged: each stream shows what the other one sees.
-
-    Both images of a frame must be affected, and follow each other.
-    """
+    """Left and right exchanged: each stream shows what the other one sees."""
 
     def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
-        """Yield all images, affected ones with the pixels of their partners."""
         held: FaultyImage | None = None
         for image in images:
             if not self.applies_to(image):
@@ -167,19 +123,11 @@ class Exchanged(Fault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Elsewhere(Fault):
-    """A camera that was switched off, carried away and switched on again.
-
-    Parameters
-    ----------
-    other : Source
-        Recording of the other place: frames of the same numbers are shown, with unchanged stamps.
-        Images for which it has none stay as they are.
-    """
+    """A camera that was switched off, carried away and switched on again."""
 
     other: Source
 
     def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
-        """Yield all images, affected ones with the pixels of the other recording."""
         others = [[image for image in self.other.images() if image.stream == n] for n in (0, 1)]
         for image in images:
             shown = others[image.given.stream][image.frame : image.frame + 1]
@@ -189,26 +137,12 @@ class Elsewhere(Fault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BrokenOff(Fault):
-    """A recording that cannot be read on.
-
-    Parameters
-    ----------
-    error : type of exception
-        Raised in place of the first affected image.
-    message : str
-    """
+    """A recording that cannot be read on."""
 
     error: type[Exception] = RecordingError
     message: str = "the file is cut off"
 
     def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
-        """Yield the images before the first affected one.
-
-        Raises
-        ------
-        Exception
-            Of the type and with the message given.
-        """
         for image in images:
             if self.applies_to(image):
                 raise self.error(self.message)
@@ -216,22 +150,15 @@ class BrokenOff(Fault):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Unloadable(ImageFault):
-    """Images that cannot be loaded.
-
-    Parameters
-    ----------
-    error : type of exception
-        Raised by `StampedImage.load`.
-    message : str
-    """
+class Unloadable(Fault):
+    """Images that cannot be loaded."""
 
     error: type[Exception] = RecordingError
     message: str = "the image is damaged"
 
-    def change_image(self, image: FaultyImage) -> FaultyImage:
-        """Return the image with a `load` that fails."""
-        return image.with_pixels(self._fail)
+    def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
+        for image in images:
+            yield image.with_pixels(self._fail) if self.applies_to(image) else image
 
     def _fail(self) -> Pixels:
         raise self.error(self.message)
@@ -242,49 +169,35 @@ class StampFault(Fault):
     """A wrong stamp; a subclass overrides `restamp`. The clock of the recording is right."""
 
     def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
-        """Yield all images, affected ones with another stamp."""
         start_ns: int | None = None
         for image in images:
-            start_ns = image.stamp_ns if start_ns is None else start_ns
-            is_affected = self.applies_to(image)
-            yield image.with_stamp(self.restamp(image, start_ns)) if is_affected else image
+            start_ns = image.given.stamp_ns if start_ns is None else start_ns
+            if self.applies_to(image):
+                stamp_ns = self.restamp(image, start_ns)
+                image = replace(image, given=replace(image.given, stamp_ns=stamp_ns))
+            yield image
 
     def restamp(self, image: FaultyImage, start_ns: int) -> int:
-        """Return the stamp of an image in nanoseconds; that of the first one is `start_ns`."""
         return image.given.stamp_ns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StampShift(StampFault):
-    """A clock that is set to another time, or an offset between two clocks.
-
-    Parameters
-    ----------
-    by_s : float
-        Seconds; negative: back.
-    """
+    """A clock that is set to another time, or an offset between two clocks."""
 
     by_s: float = 3600.0
 
     def restamp(self, image: FaultyImage, start_ns: int) -> int:
-        """Return the stamp, shifted."""
         return image.given.stamp_ns + round(self.by_s * 1e9)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StampConstant(StampFault):
-    """A driver that does not stamp: all images have the same stamp.
-
-    Parameters
-    ----------
-    stamp_ns : int or None
-        Nanoseconds; None: that of the first image of the recording.
-    """
+    """A driver that does not stamp: all images have the same stamp."""
 
     stamp_ns: int | None = 0
 
     def restamp(self, image: FaultyImage, start_ns: int) -> int:
-        """Return the common stamp."""
         return start_ns if self.stamp_ns is None else self.stamp_ns
 
 
@@ -293,7 +206,6 @@ class StampFromZero(StampFault):
     """A clock that starts with the recording: the first stamp is 0."""
 
     def restamp(self, image: FaultyImage, start_ns: int) -> int:
-        """Return the time since the first image."""
         return image.given.stamp_ns - start_ns
 
 
@@ -302,62 +214,92 @@ class StampBackwards(StampFault):
     """A clock that runs backwards."""
 
     def restamp(self, image: FaultyImage, start_ns: int) -> int:
-        """Return the stamp, mirrored at the start."""
         return 2 * start_ns - image.given.stamp_ns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StampRate(StampFault):
-    """A clock that drifts.
-
-    Parameters
-    ----------
-    rate : float
-        Seconds of the clock in a second.
-    """
+    """A clock that drifts."""
 
     rate: float = 1.001
 
     def restamp(self, image: FaultyImage, start_ns: int) -> int:
-        """Return the stamp of the clock that was right at the start."""
         return start_ns + round(self.rate * (image.given.stamp_ns - start_ns))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StampUnit(StampFault):
-    """Stamps in another unit, taken for nanoseconds.
-
-    Parameters
-    ----------
-    unit_ns : int
-        Nanoseconds of the unit: 10^9 for seconds.
-    """
+    """Stamps in another unit, taken for nanoseconds."""
 
     unit_ns: int = 1_000_000_000
 
     def restamp(self, image: FaultyImage, start_ns: int) -> int:
-        """Return the stamp in whole units."""
         return image.given.stamp_ns // self.unit_ns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StampJitter(StampFault):
-    """Stamps of the arrival, not of the exposure.
-
-    Parameters
-    ----------
-    sigma_s : float
-        Standard deviation, seconds; errors end at three of them.
-    is_shared : bool
-        Both images of a frame have the same error.
-    """
+    """Stamps of the arrival, not of the exposure."""
 
     sigma_s: float = 0.01
     is_shared: bool = True
 
     def restamp(self, image: FaultyImage, start_ns: int) -> int:
-        """Return the stamp with its error."""
         given = replace(image.given, stream=0) if self.is_shared else image.given
         error = float(self.rng(replace(image, given=given)).standard_normal())
         error = math.copysign(min(abs(error), 3.0), error)
         return image.given.stamp_ns + round(1e9 * self.sigma_s * error)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrationFault(Fault):
+    """A wrong calibration, for the whole recording."""
+
+    def change_info(self, info: RecordingInfo) -> RecordingInfo:
+        calibrations = tuple(
+            self.miscalibrate(calibration) if stream in self.streams else calibration
+            for stream, calibration in enumerate(info.calibrations)
+        )
+        return replace(info, calibrations=calibrations)
+
+    def miscalibrate(self, calibration: Calibration) -> Calibration:
+        return calibration
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WrongBaseline(CalibrationFault):
+    """A baseline in another unit, or of another rig."""
+
+    factor: float = 2.0
+
+    def miscalibrate(self, calibration: Calibration) -> Calibration:
+        P = calibration.P.copy()
+        P[:, 3] *= self.factor
+        return replace(calibration, P=P)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WrongFocalLength(CalibrationFault):
+    """The focal length of another lens; the baseline stays right."""
+
+    factor: float = 1.3
+
+    def miscalibrate(self, calibration: Calibration) -> Calibration:
+        K, P = calibration.K.copy(), calibration.P.copy()
+        K[:2, :2] *= self.factor
+        P[:2, [0, 1, 3]] *= self.factor
+        return replace(calibration, K=K, P=P)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WrongPrincipalPoint(CalibrationFault):
+    """The principal point of another camera; off by shares of width and height."""
+
+    by: tuple[float, float] = (0.1, 0.1)
+
+    def miscalibrate(self, calibration: Calibration) -> Calibration:
+        K, P = calibration.K.copy(), calibration.P.copy()
+        shift = np.array([self.by[0] * calibration.width, self.by[1] * calibration.height])
+        K[:2, 2] += shift
+        P[:2, 2] += shift
+        return replace(calibration, K=K, P=P)

@@ -8,7 +8,7 @@ from typing import Literal, TypeAlias
 import cv2
 import numpy as np
 
-from gvo.testing.faults.fault import FaultyImage, Kind, PixelFault, Pixels
+from gvo.testing.faults import FaultyImage, PixelFault, Pixels
 
 _WHITE = 255
 Turn: TypeAlias = Literal["upside down", "mirrored", "half turn", "transposed"]
@@ -16,28 +16,12 @@ PixelType: TypeAlias = Literal["float64", "float32", "uint16", "int32", "bool", 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Black(PixelFault):
-    """Black images: a cap on the lens, no light."""
-
-    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return zeros."""
-        return np.zeros_like(pixels)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class White(PixelFault):
-    """Saturated images: the sun, the end of a tunnel.
-
-    Parameters
-    ----------
-    part : float
-        Share of the columns, from the left.
-    """
+    """Saturated images: the sun, the end of a tunnel."""
 
     part: float = 1.0
 
-    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the image with white columns."""
+    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
         spoilt = pixels.copy()
         spoilt[:, : round(self.part * pixels.shape[1])] = _WHITE
         return spoilt
@@ -45,69 +29,43 @@ class White(PixelFault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Blurred(PixelFault):
-    """Images out of focus.
-
-    Parameters
-    ----------
-    sigma_px : float
-        Standard deviation of the Gaussian, pixels.
-    """
+    """Images out of focus."""
 
     sigma_px: float = 4.0
 
-    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the image, smoothed."""
+    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
         return np.asarray(cv2.GaussianBlur(pixels, (0, 0), self.sigma_px))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionBlurred(PixelFault):
-    """Images exposed for too long while the camera turns.
-
-    Parameters
-    ----------
-    length_px : int
-        Length of the blur along the rows, pixels.
-    """
+    """Images exposed for too long while the camera turns."""
 
     length_px: int = 15
 
-    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the image, blurred along its rows."""
+    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
         return np.asarray(cv2.blur(pixels, (self.length_px, 1)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Noisy(PixelFault):
-    """Images with much noise: gain turned up at night.
-
-    Parameters
-    ----------
-    sigma : float
-        Standard deviation of Gaussian noise, grey values.
-    """
+    """Images with much noise: gain turned up at night."""
 
     sigma: float = 40.0
 
-    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the image with noise."""
+    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
+        rng = self.rng(image)
         return _to_uint8(pixels + self.sigma * rng.standard_normal(pixels.shape))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SaltAndPepper(PixelFault):
-    """Single pixels white or black: bit errors, a damaged sensor.
-
-    Parameters
-    ----------
-    density : float
-        Share of the pixels.
-    """
+    """Single pixels white or black: bit errors, a damaged sensor."""
 
     density: float = 0.1
 
-    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the image with some pixels at either end of the range."""
+    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
+        rng = self.rng(image)
         spoilt = pixels.copy()
         chance = rng.random(pixels.shape[:2])
         spoilt[chance < 0.5 * self.density] = 0
@@ -117,62 +75,35 @@ class SaltAndPepper(PixelFault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Exposed(PixelFault):
-    """Images brighter or darker than the others.
-
-    Parameters
-    ----------
-    factor : float
-        Factor of the grey values.
-    """
+    """Images brighter or darker than the others."""
 
     factor: float = 2.0
 
-    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the image at another exposure."""
+    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
         return _to_uint8(self.factor * pixels.astype(np.float64))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Flickering(PixelFault):
-    """Brightness that oscillates from frame to frame, as under mains lamps.
-
-    Parameters
-    ----------
-    amplitude : float
-        Share of the brightness.
-    period : float
-        Frames.
-    """
+    """Brightness that oscillates from frame to frame, as under mains lamps."""
 
     amplitude: float = 0.4
     period: float = 3.3
 
-    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the image, brighter or darker by its number."""
+    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
         swing = np.sin(2.0 * np.pi * image.frame / self.period)
         return _to_uint8((1.0 + self.amplitude * swing) * pixels.astype(np.float64))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Banded(PixelFault):
-    """Bands that roll through the image: a rolling shutter under mains lamps.
-
-    Parameters
-    ----------
-    amplitude : float
-        Share of the brightness.
-    period_rows : float
-        Height of a bright and a dark band, rows.
-    rows_per_frame : float
-        Motion of the bands, rows.
-    """
+    """Bands that roll through the image: a rolling shutter under mains lamps."""
 
     amplitude: float = 0.4
     period_rows: float = 40.0
     rows_per_frame: float = 7.0
 
-    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the image with bright and dark rows."""
+    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
         rows = np.arange(pixels.shape[0]) + self.rows_per_frame * image.frame
         gain = 1.0 + self.amplitude * np.sin(2.0 * np.pi * rows / self.period_rows)
         gain = gain.reshape(-1, *[1] * (pixels.ndim - 1))
@@ -181,21 +112,12 @@ class Banded(PixelFault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Covered(PixelFault):
-    """A drop, dirt or part of the robot in front of the lens: blobs that stay where they are.
-
-    Parameters
-    ----------
-    part : float
-        Approximate share of the image that is covered.
-    n_blobs : int
-        Number of blobs, the same in all images of a stream.
-    """
+    """A drop, dirt or part of the robot in front of the lens: blobs that stay where they are."""
 
     part: float = 0.25
     n_blobs: int = 3
 
-    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the image with mottled grey blobs."""
+    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
         height, width = pixels.shape[:2]
         fixed = np.random.default_rng([self.seed, image.given.stream])
         radius = float(np.sqrt(self.part * height * width / (np.pi * self.n_blobs)))
@@ -218,78 +140,49 @@ def _to_uint8(values: Pixels) -> Pixels:
 class DepthFault(PixelFault):
     """A fault of depth images; grey and colour images stay as they are."""
 
-    def kinds(self) -> tuple[Kind, ...]:
-        """Return "depth"."""
-        return ("depth",)
+    def is_possible(self, is_depth: bool) -> bool:
+        return is_depth
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DepthConstant(DepthFault):
-    """Depth that is one value everywhere.
-
-    Parameters
-    ----------
-    depth_m : float
-        Metres; may be NaN, zero, infinite or negative.
-    """
+    """Depth that is one value everywhere."""
 
     depth_m: float = float("nan")
 
-    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return an image of one value."""
+    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
         return np.full_like(pixels, self.depth_m)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DepthScaled(DepthFault):
-    """Depth in another unit.
-
-    Parameters
-    ----------
-    factor : float
-        1000: millimetres taken for metres.
-    """
+    """Depth in another unit."""
 
     factor: float = 1000.0
 
-    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the depth, multiplied."""
+    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
         return (self.factor * pixels).astype(pixels.dtype)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DepthQuantized(DepthFault):
-    """Depth in coarse steps.
-
-    Parameters
-    ----------
-    step_m : float
-    """
+    """Depth in coarse steps."""
 
     step_m: float = 0.25
 
-    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the depth, rounded."""
+    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
         return (self.step_m * np.rint(pixels / self.step_m)).astype(pixels.dtype)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DepthHoles(DepthFault):
-    """Depth that is unknown in most places: sunlight, dark or shiny surfaces.
-
-    Parameters
-    ----------
-    part : float
-        Share of the pixels.
-    size_px : int
-        Approximate size of a hole.
-    """
+    """Depth that is unknown in most places: sunlight, dark or shiny surfaces."""
 
     part: float = 0.9
     size_px: int = 8
 
-    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the depth with holes, at random in each image."""
+    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
+        rng = self.rng(image)
         height, width = pixels.shape[:2]
         cells = rng.random((height // self.size_px + 1, width // self.size_px + 1))
         is_hole = cells < self.part
@@ -303,35 +196,22 @@ class DepthHoles(DepthFault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DepthSaturated(DepthFault):
-    """Depth that ends at the sensor's range, also at unknown pixels.
-
-    Parameters
-    ----------
-    depth_m : float
-        The largest depth, metres.
-    """
+    """Depth that ends at the sensor's range, also at unknown pixels."""
 
     depth_m: float = 2.0
 
-    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the depth, limited and known everywhere."""
+    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
         return np.asarray(np.fmin(pixels, self.depth_m), dtype=pixels.dtype)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DepthNoisy(DepthFault):
-    """Depth with much noise, growing with its square.
-
-    Parameters
-    ----------
-    sigma_m : float
-        Standard deviation at one metre.
-    """
+    """Depth with much noise, growing with its square."""
 
     sigma_m: float = 0.05
 
-    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the depth with noise."""
+    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
+        rng = self.rng(image)
         noise = self.sigma_m * pixels**2 * rng.standard_normal(pixels.shape)
         return (pixels + noise).astype(pixels.dtype)
 
@@ -340,28 +220,19 @@ class DepthNoisy(DepthFault):
 class _AnyImageFault(PixelFault):
     """A fault of images of all kinds."""
 
-    def kinds(self) -> tuple[Kind, ...]:
-        """Return all kinds."""
-        return ("image", "depth")
+    def is_possible(self, is_depth: bool) -> bool:
+        return True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HalfWritten(PixelFault):
-    """Images whose transfer was interrupted.
-
-    Parameters
-    ----------
-    part : float
-        Share of the rows that arrived.
-    fill : {"grey", "garbage", "former"}
-        Content of the others: one value, noise, or the upper rows again.
-    """
+    """Images whose transfer was interrupted."""
 
     part: float = 0.5
     fill: Literal["grey", "garbage", "former"] = "grey"
 
-    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the image with other pixels below."""
+    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
+        rng = self.rng(image)
         n_rows = round(self.part * len(pixels))
         spoilt = pixels.copy()
         rest = spoilt[n_rows:]
@@ -376,18 +247,12 @@ class HalfWritten(PixelFault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RowsShifted(PixelFault):
-    """Rows out of place: bytes missing in the transfer.
-
-    Parameters
-    ----------
-    most_px : int
-        Limit of the random shift of each of eight bands of rows, pixels.
-    """
+    """Rows out of place: bytes missing in the transfer."""
 
     most_px: int = 40
 
-    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the image with bands of rows rolled."""
+    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
+        rng = self.rng(image)
         bands = np.array_split(pixels, 8)
         shifts = rng.integers(-self.most_px, self.most_px + 1, len(bands)).tolist()
         rolled = [np.roll(band, by, axis=1) for band, by in zip(bands, shifts, strict=True)]
@@ -396,18 +261,11 @@ class RowsShifted(PixelFault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Turned(_AnyImageFault):
-    """Images turned or mirrored by the mounting of the camera or a setting of the driver.
-
-    Parameters
-    ----------
-    how : {"upside down", "mirrored", "half turn", "transposed"}
-        Rows in opposite order, columns in opposite order, both, or rows and columns exchanged.
-    """
+    """Images turned or mirrored by the mounting of the camera or a setting of the driver."""
 
     how: Turn = "upside down"
 
-    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the image, turned."""
+    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
         views = {
             "upside down": pixels[::-1],
             "mirrored": pixels[:, ::-1],
@@ -419,35 +277,22 @@ class Turned(_AnyImageFault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Resized(_AnyImageFault):
-    """Images of another size than that of the calibration.
-
-    Parameters
-    ----------
-    factor : float
-    """
+    """Images of another size than that of the calibration."""
 
     factor: float = 0.5
 
-    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the image, smaller or larger."""
+    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
         size = [max(round(self.factor * length), 1) for length in pixels.shape[1::-1]]
         return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_NEAREST))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OfType(_AnyImageFault):
-    """Pixels of a type or shape that a source must not give.
-
-    Parameters
-    ----------
-    pixel_type : {"float64", "float32", "uint16", "int32", "bool", "colour", "flat"}
-        "colour": three channels instead of one; "flat": all pixels in one row.
-    """
+    """Pixels of a type or shape that a source must not give."""
 
     pixel_type: PixelType = "float64"
 
-    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the same values in another type."""
+    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
         if self.pixel_type == "flat":
             return pixels.reshape(-1)
         if self.pixel_type == "colour":
@@ -459,19 +304,12 @@ class OfType(_AnyImageFault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shifted(_AnyImageFault):
-    """Images shifted against those of the other stream: a knock on the rig, a wrong registration.
-
-    Parameters
-    ----------
-    rows, columns : int
-        Pixels, down and to the right; filled by the border, in depth by NaN.
-    """
+    """Images shifted against those of the other stream: a knock on the rig."""
 
     rows: int = 0
     columns: int = 0
 
-    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the image, shifted."""
+    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
         pad = [(abs(self.rows),) * 2, (abs(self.columns),) * 2, *[(0, 0)] * (pixels.ndim - 2)]
         if pixels.dtype.kind == "f":
             padded = np.pad(pixels, pad, constant_values=np.nan)

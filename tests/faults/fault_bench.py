@@ -17,14 +17,14 @@ from gvo.diagnostics.check import check_recording
 from gvo.errors import GvoError
 from gvo.geometry import se3
 from gvo.io.recording import Sensor
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording
 from gvo.testing.faults import FaultyImage, FaultySource
 from gvo.trajectory.formats import read_covariances, read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
 from tests.conftest import run_of
+from tests.faults.catalogue import NamedFault
 from tests.recordings import Held, hold
-from tests.testing.catalogue import NamedFault
 
 _SCALE = 0.4
 

@@ -9,17 +9,10 @@ import numpy as np
 import pytest
 
 from gvo.io.recording import Sensor
-from gvo.testing.faults import (
-    Elsewhere,
-    Exchanged,
-    FaultySource,
-    Frozen,
-    Lagging,
-    PixelFault,
-    RowsShifted,
-)
-from tests.testing.catalogue import FAULTS, NamedFault, parameters
-from tests.testing.fault_bench import Outcome, complaints, faulty, run, sound
+from gvo.testing import FaultySource
+from tests.faults import Elsewhere, Exchanged, Frozen, Lagging, PixelFault, RowsShifted
+from tests.faults.catalogue import FAULTS, MADE, PAGE, NamedFault, parameters
+from tests.faults.fault_bench import Outcome, complaints, faulty, run, sound
 
 # Of six honest errors, 3 in 10,000 are beyond five sigmas; those of 20 poses are dependent.
 _MAX_DEVIATION = 6.0
@@ -235,3 +228,19 @@ def test_a_sound_recording_is_complete(sensor: Sensor, tmp_path: Path) -> None:
     assert outcome.errors_m.max() < 0.4 * _MAX_ERROR_M
     assert outcome.deviations.max() < _MAX_DEVIATION
     assert complaints(source) == set()
+
+
+def test_the_page_shows_each_fault_that_is_made() -> None:
+    assert list(FAULTS) == list(MADE)
+    assert f"{len(FAULTS)} faults" in PAGE.read_text()
+    assert any(fault.is_silent for fault in FAULTS.values())
+
+
+def test_the_short_run_takes_one_fault_of_each_group() -> None:
+    chosen = [fault.group for fault in FAULTS.values() if not parameters(fault=fault).marks]
+    assert chosen == list(dict.fromkeys(fault.group for fault in FAULTS.values()))
+    assert len(chosen) == 7
+
+
+def test_what_is_expected_is_of_faults_that_exist() -> None:
+    assert {*N_SKIPPED, *N_UNPAIRED, *TOLD} <= set(FAULTS)

@@ -12,8 +12,8 @@ import cv2
 import pytest
 
 from gvo.io.recording import Sensor, Source
-from gvo.testing import faults as made
 from gvo.testing.faults import Fault, FaultySource, PixelFault
+from tests import faults as made
 
 PAGE = Path(__file__).parents[2] / "docs/reliability.md"
 _SENSORS: dict[str | None, tuple[Sensor, ...]] = {
