@@ -181,7 +181,8 @@ def view(task: Task) -> Picture | None:
         Player(lambda config: gvo.open_recording(task.bag, config=config), Config()) as player,
         serve(player, port=0, truth=truth, name=task.bag.name) as server,
     ):
-        player.seek(task.frame)
+        for _ in range(task.frame + 1):
+            player.step()
         player.wait()
         driver = open_page(server.url)
         try:
@@ -189,7 +190,7 @@ def view(task: Task) -> Picture | None:
             driver.execute_script(HIDE_COMPLAINT)
             for title in ("Parameters", "klt"):
                 unfold(driver, title)
-            view = player.frame_view
+            view = player.newest.view()
             if view is None:
                 raise RecordingError(f"{task.bag}: {player.fault}")
             R, t = view.T_world_frame[:3, :3], view.T_world_frame[:3, 3]

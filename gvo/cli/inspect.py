@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,7 +16,7 @@ from gvo.cli.terminal import (
     say,
     warn,
 )
-from gvo.errors import GvoError
+from gvo.errors import ConfigurationError, GvoError
 
 if TYPE_CHECKING:
     from gvo.io.recording import Source
@@ -59,7 +58,7 @@ def explain(
 def view(
     recordings: Annotated[
         list[Path],
-        Argument(metavar="RECORDING...", help="Bags, a data-set folder, or a run's folder."),
+        Argument(metavar="RECORDING...", help="Bags, or a data-set folder."),
     ],
     *,
     host: Annotated[
@@ -76,17 +75,17 @@ def view(
     from gvo.viz.view import serve
     from gvo.viz.view.player import Player
 
+    for path in recordings:
+        if (path / "frames.csv").is_file():
+            raise ConfigurationError(
+                f"{path}: is a run, not a recording; open {path / 'report.html'} to look at it "
+                "(gvo run --rerun FILE writes it for Rerun)"
+            )
     with interruptible() as check, ExitStack() as stack:
-        shown: Player | Path = recordings[0]
-        truth: Trajectory | None = None
-        if len(recordings) == 1 and (recordings[0] / "frames.csv").is_file():
-            why = "is a finished run, which is shown as it was made; give the recording itself"
-            opt.refuse(f"{recordings[0]} {why}", config=config, set=set_, **asdict(options))
-        else:
-            reopen = partial(opt.open_source, recordings, options=options)
-            player = stack.enter_context(Player(reopen, opt.load(config, set_)))
-            shown, truth = player, _find_truth(player.source)
-        server = stack.enter_context(serve(shown, host=host, port=port, truth=truth))
+        reopen = partial(opt.open_source, recordings, options=options)
+        player = stack.enter_context(Player(reopen, opt.load(config, set_)))
+        truth = _find_truth(player.source)
+        server = stack.enter_context(serve(player, host=host, port=port, truth=truth))
         warn([server.note] if server.note else [])
         say(f"{server.url} shows {recordings[0].name}; Ctrl-C ends")
         while not server.wait(_SIGNALS_S):

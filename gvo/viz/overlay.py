@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, TypeAlias
 
@@ -28,6 +28,7 @@ from gvo.types import (
     StereoFrame,
 )
 from gvo.viz.palette import ESTIMATES, INLIERS, OUTLIERS, STATUSES, rgb
+from gvo.viz.scene import loop_text, placed_matches
 
 Colour: TypeAlias = tuple[int, int, int]
 """BGR."""
@@ -136,13 +137,7 @@ def _disc(radius: float) -> IntArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DepthScale:
-    """Viridis over the logarithm of depth: near is bright.
-
-    Parameters
-    ----------
-    near_m, far_m : float
-        Depths of the ends; depths beyond take the colour of the end.
-    """
+    """Viridis over the logarithm of depth: near is bright; beyond the ends, their colours."""
 
     near_m: float
     far_m: float
@@ -180,20 +175,7 @@ def table() -> ImageArray:
 
 
 def paint_depth(depth: DepthArray, scale: DepthScale, size: tuple[int, int]) -> ImageArray:
-    """Return a depth image in colours, unknown depth dark.
-
-    Parameters
-    ----------
-    depth : ndarray of float32, shape (h, w)
-        Metres, NaN = unknown.
-    scale : DepthScale
-    size : tuple of two int
-        Width and height of the picture.
-
-    Returns
-    -------
-    ndarray of uint8, shape (height, width, 3)
-    """
+    """Return a depth image (h, w), metres, in colours of the size (width, height), unknown dark."""
     # no interpolation: there is nothing between a near and a far pixel
     resized = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST)
     # a table over even steps of depth replaces slow logarithms of all pixels
@@ -250,8 +232,6 @@ MIN_WIDTH_PX: Final = 640
 """Of a picture, for its text."""
 MAX_WIDTH_PX: Final = 1280
 """Of a picture, by default."""
-NOTHING: Final = RelativePose(T_reference_current=np.eye(4), covariance=np.zeros((6, 6)))
-"""A registration without matches."""
 
 _WIDE = 2.0  # least aspect ratio of images whose panels are stacked
 _MARGIN_PX = 8
@@ -382,41 +362,17 @@ def draw_matches(
     return canvas
 
 
-def placed_matches(result: FrameResult) -> RelativePose:
-    """Return the registration of a frame with those matches that have points; none without it."""
-    found = result.registration or NOTHING
-    n = min(len(found.pixels_current), len(found.points_current))
-    names = "pixels_reference", "pixels_current", "points_current", "inliers"
-    return replace(found, **{name: getattr(found, name)[:n] for name in names})
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
-    """Two panels of equal size, stacked or side by side, between a header and a footer.
+    """Two panels of equal size, stacked or side by side, between a header and a footer."""
 
-    Parameters
-    ----------
-    panel : tuple of two int
-        Width and height of a panel, pixels; even, as video encoders require.
-    scale : float
-        Panel pixels per image pixel.
-    is_stacked : bool
-        Panels are stacked, not side by side.
-    """
-
-    panel: tuple[int, int]
-    scale: float
+    panel: tuple[int, int]  # width and height, even, as video encoders require
+    scale: float  # panel pixels per image pixel
     is_stacked: bool
 
     @classmethod
     def of(cls, camera: PinholeCamera, max_width: int) -> Layout:
-        """Return the layout for the images of a camera.
-
-        Raises
-        ------
-        ValueError
-            When `max_width` is too narrow for the text.
-        """
+        """Return the layout for the images of a camera."""
         if max_width < MIN_WIDTH_PX:
             raise ValueError(f"max_width must be at least {MIN_WIDTH_PX}, got {max_width}")
         is_stacked = camera.width >= _WIDE * camera.height
@@ -535,22 +491,6 @@ def _write_row(
     for text, colour in texts:
         u = write(canvas, text, (u, v), colour)[0] + _GAP_PX
     return u
-
-
-def loop_text(result: FrameResult) -> str:
-    """Say to what the newest loop of a frame leads; nothing where there is none."""
-    if not result.loops:
-        return ""
-    loop = result.loops[-1]
-    ago_s = 1e-9 * (loop.stamp_ns - loop.reference_ns)
-    return f"loop to {ago_s:.1f} s before, {loop.n_inliers} inliers"
-
-
-def caption(result: FrameResult) -> list[str]:
-    """Say how a frame was tracked, in a line, and what is special about it, in others."""
-    counts = f"{result.n_inliers} of {result.n_matches} matches are inliers, {result.n_links} links"
-    special = result.reason, loop_text(result)
-    return [f"{result.status}: {counts}", *(text for text in special if text)]
 
 
 def _counts(result: FrameResult) -> list[tuple[str, Colour]]:

@@ -67,6 +67,19 @@ LOOP_STYLES = {
 }
 """Of the lines between both ends of loops."""
 
+DRAWN = {
+    **ESTIMATES,
+    "truth": REFERENCE,
+    "keyframes": LINKS["keyframe"],
+    "step": LINKS["step"],
+    "keyframe link": LINKS["keyframe"],
+    "depth": LINKS["depth"],
+    "refused": REFUSED,
+    "loops": ESTIMATES["global"],
+    "ellipsoids": OTHERS[3],
+}
+"""Of what is drawn in 3-D, by the names in a `gvo.viz.scene.Scene`."""
+
 
 def styles_of(names: Iterable[str]) -> list[Style]:
     """Return a style for each name: the fixed colour of a word in it, once, or the next free one.

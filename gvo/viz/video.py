@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import io
+import os
+import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -11,7 +12,6 @@ from typing import Final
 
 import cv2
 import numpy as np
-from PIL import Image, features
 
 from gvo.errors import ConfigurationError, RecordingError, write_faults
 from gvo.io.images import encode_image
@@ -23,15 +23,6 @@ CODECS: Final = {".webm": "VP80", ".mp4": "mp4v"}
 _N_PERIODS = 8  # that tell the rate
 _FALLBACK_HZ = 10.0
 _SLOWEST_HZ, _FASTEST_HZ = 0.1, 240.0
-# A lossy WebP file is a key frame of VP8 behind a header. Pillow encodes it several times as fast
-# as OpenCV, which has no option for that, encodes VP8 at the rate of a film.
-_QUALITY, _FASTEST_METHOD = 80, 0
-_WEBP_HEADER_BYTES = 20
-# OpenCV complains on the error stream where it writes VP8 to WebM, but not to Matroska, of which
-# WebM is a part: only the name of the format in the header differs. An empty element fills up.
-_CONTAINERS = {".webm": ".mkv", ".mp4": ".mp4"}
-_MATROSKA = b"\x42\x82\x88matroska"
-_WEBM = b"\x42\x82\x84webm\xec\x82\x00\x00"
 
 
 def open_sink(path: Path) -> Film | PngFolder:
@@ -80,7 +71,7 @@ class Film:
     Raises
     ------
     RecordingError
-        When the folder cannot be written.
+        When the folder or the film cannot be written; so do all methods.
     """
 
     def __init__(self, path: Path) -> None:
@@ -93,8 +84,7 @@ class Film:
         with write_faults(RecordingError, path):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._folder = tempfile.TemporaryDirectory(dir=path.parent, prefix=".gvo-film-")
-        self._is_vp8 = path.suffix.lower() == ".webm"
-        self._part = Path(self._folder.name) / f"film{_CONTAINERS[path.suffix.lower()]}"
+        self._part = Path(self._folder.name) / f"film{path.suffix.lower()}"
 
     def add(self, picture: ImageArray, stamp_ns: int) -> None:
         """Encode one more picture.
@@ -102,7 +92,7 @@ class Film:
         Parameters
         ----------
         picture : ndarray of uint8, shape (height, width, 3)
-            BGR, of the size of the first.
+            BGR, of the size of the first; an odd last row or column is cut off.
         stamp_ns : int
             When it was taken, nanoseconds.
 
@@ -110,11 +100,9 @@ class Film:
         ------
         ValueError
             When it is of another size.
-        RecordingError
-            When the film cannot be written.
         """
         height, width = picture.shape[:2]
-        # Encoders subsample colours by two: an odd last row or column is cut off.
+        # Encoders subsample colours by two.
         picture = np.ascontiguousarray(picture[: height & ~1, : width & ~1])
         size = (picture.shape[1], picture.shape[0])
         if self._n > 0 and size != self._size:
@@ -122,7 +110,7 @@ class Film:
         self._size = size
         self._n += 1
         if self._writer is not None:
-            self._writer.write(self._encoded(picture))
+            self._writer.write(picture)
             return
         self._waiting.append(picture)
         self._stamps_ns.append(stamp_ns)
@@ -130,60 +118,31 @@ class Film:
             self._begin()
 
     def close(self) -> None:
-        """Finish the film and give it its name; without pictures no file is left.
-
-        Raises
-        ------
-        RecordingError
-            When it cannot be written, or was not written whole.
-        """
+        """Finish the film and give it its name; without pictures no file is left."""
         with self._folder, write_faults(RecordingError, self.path):
             if self._waiting:
                 self._begin()
             if self._writer is None:
                 return
             self._writer.release()
-            n_written = _count_packets(self._part)
+            n_written = count_pictures(self._part)
             if n_written != self._n:
                 raise RecordingError(
                     f"{self.path}: was not written whole: {n_written} of {self._n} frames; is its "
                     "disk full?"
                 )
-            if self._is_vp8:
-                _name_webm(self._part)
             self._part.rename(self.path)
 
     def _begin(self) -> None:
-        codec = CODECS[self.path.suffix.lower()]
-        self._writer = _open_writer(self._part, codec, rate_of(self._stamps_ns), self._size)
+        self._writer = _open_writer(self._part, rate_of(self._stamps_ns), self._size)
         if self._writer is None:
             raise RecordingError(f"{self.path}: OpenCV could not open it as a film")
         for picture in self._waiting:
-            self._writer.write(self._encoded(picture))
+            self._writer.write(picture)
         self._waiting.clear()
 
-    def _encoded(self, picture: ImageArray) -> ImageArray:
-        return _encode_vp8(picture) if self._is_vp8 else picture
 
-
-def _encode_vp8(picture: ImageArray) -> ImageArray:
-    """Return a BGR picture as the bytes of a key frame, shape (1, n)."""
-    height, width = picture.shape[:2]
-    webp = io.BytesIO()
-    image = Image.frombuffer("RGB", (width, height), picture.tobytes(), "raw", "BGR", 0, 1)
-    image.save(webp, "WEBP", quality=_QUALITY, method=_FASTEST_METHOD)
-    return np.frombuffer(webp.getbuffer(), dtype=np.uint8)[np.newaxis, _WEBP_HEADER_BYTES:]
-
-
-def _name_webm(path: Path) -> None:
-    """Say in the header that a Matroska film is a WebM film."""
-    with path.open("r+b") as stream:
-        header = stream.read(64)
-        stream.seek(0)
-        stream.write(header.replace(_MATROSKA, _WEBM))
-
-
-def _count_packets(path: Path) -> int:
+def count_pictures(path: Path) -> int:
     """Return the number of encoded pictures in a film."""
     with _quiet_opencv():
         packets = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
@@ -206,7 +165,7 @@ class PngFolder:
     Raises
     ------
     RecordingError
-        When the folder holds something already or cannot be written.
+        When the folder holds something already or cannot be written; so do all methods.
     """
 
     def __init__(self, path: Path, decisions: tuple[str, ...] = ()) -> None:
@@ -219,13 +178,7 @@ class PngFolder:
             raise RecordingError(f"{path}: is not empty; give another folder or empty it")
 
     def add(self, picture: ImageArray, stamp_ns: int) -> None:
-        """Write one more picture, shape (height, width, 3), BGR.
-
-        Raises
-        ------
-        RecordingError
-            When it cannot be written.
-        """
+        """Write one more picture, shape (height, width, 3), BGR."""
         with write_faults(RecordingError, self.path):
             (self.path / f"{self._n:06d}.png").write_bytes(encode_image(picture, ".png"))
         self._n += 1
@@ -239,11 +192,8 @@ class PngFolder:
 
 def has_encoder(suffix: str) -> bool:
     """Tell whether films of a suffix of `CODECS` can be written."""
-    if suffix == ".webm" and not features.check("webp"):
-        return False
     with tempfile.TemporaryDirectory(prefix="gvo-film-") as folder:
-        path = Path(folder) / f"film{_CONTAINERS[suffix]}"
-        return _open_writer(path, CODECS[suffix], _FALLBACK_HZ, (64, 64)) is not None
+        return _open_writer(Path(folder) / f"film{suffix}", _FALLBACK_HZ, (64, 64)) is not None
 
 
 def rate_of(stamps_ns: Sequence[int]) -> float:
@@ -255,23 +205,33 @@ def rate_of(stamps_ns: Sequence[int]) -> float:
     return float(np.clip(1e9 / np.median(periods_ns), _SLOWEST_HZ, _FASTEST_HZ))
 
 
-def _open_writer(
-    path: Path, codec: str, rate_hz: float, size: tuple[int, int]
-) -> cv2.VideoWriter | None:
-    """Open a film: of pictures that are encoded already where it is of VP8."""
-    options = [cv2.VIDEOWRITER_PROP_RAW_VIDEO, 1] if codec == "VP80" else []
-    with _quiet_opencv():
-        fourcc = cv2.VideoWriter.fourcc(*codec)
-        writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, rate_hz, size, options)
+def _open_writer(path: Path, rate_hz: float, size: tuple[int, int]) -> cv2.VideoWriter | None:
+    fourcc = cv2.VideoWriter.fourcc(*CODECS[path.suffix])
+    with _quiet_opencv(), _quiet_error_stream():
+        writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, rate_hz, size)
     return writer if writer.isOpened() else None
 
 
 @contextmanager
 def _quiet_opencv() -> Iterator[None]:
-    """Keep OpenCV from printing errors that are returned as values."""
+    """Keep OpenCV from logging errors that are returned as values."""
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         yield
     finally:
         cv2.utils.logging.setLogLevel(level)
+
+
+@contextmanager
+def _quiet_error_stream() -> Iterator[None]:
+    """Drop what C code prints: OpenCV complains, past its log, of VP8 in WebM, and writes it."""
+    sys.stderr.flush()
+    kept, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(null, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(null)

@@ -330,22 +330,25 @@ def test_a_recording_is_served_to_this_machine_alone_until_ctrl_c(drive_bag: Pat
         assert end(process, signal.SIGINT) == (130, "", "")
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_a_run_is_served_beside_a_taken_port_until_it_is_ended(
-    command: Command, room_bag: Path, tmp_path: Path
-) -> None:
-    command("run", room_bag, "--out", tmp_path, "--duration", "0.2", "--no-report")
+def test_a_taken_port_is_told_and_a_signal_ends_it(room_bag: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as holder:
         taken = holder.getsockname()[1]
-        with viewing(tmp_path, "--port", taken) as (process, port):
+        with viewing(room_bag, "--port", taken) as (process, port):
             assert port != taken
-            assert "<html" in fetch(port)
-            assert set(listening(process).values()) == {"0100007F"}
             code, out, errors = end(process, signal.SIGTERM)
     assert (code, out) == (143, "")
     assert errors.startswith("gvo: warning: ")
     assert errors.count("\n") == 1
     assert str(taken) in errors
+
+
+def test_the_folder_of_a_run_is_refused_with_the_way_to_its_report(
+    command: Command, room_bag: Path, tmp_path: Path
+) -> None:
+    command("run", room_bag, "--out", tmp_path, "--duration", "0.2", "--no-report")
+    said = refused(command("view", tmp_path))
+    assert str(tmp_path / "report.html") in said
+    assert "Rerun" in said
 
 
 # Wrong use
@@ -387,6 +390,7 @@ def test_an_extra_that_is_not_installed_is_named(
     module, extra, *arguments = words
     for name in [name for name in sys.modules if name.split(".")[0] == module]:
         monkeypatch.delitem(sys.modules, name)
+    monkeypatch.delitem(sys.modules, "gvo.runs.outputs.rerun", raising=False)
     monkeypatch.setitem(sys.modules, module, None)
     said = refused(command(*(argument.format(bag=room_bag) for argument in arguments)))
     assert extra in said

@@ -25,7 +25,7 @@ from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Optimum, Progress
 from tests import faults as made
 from tests.conftest import Command, run_of
-from tests.make.bags import PoseBag
+from tests.io.pose_bags import PoseBag
 from tests.rendered_walk import (
     CAMERA,
     GLOBAL,
@@ -358,7 +358,7 @@ def test_a_bag_that_is_refused_leaves_no_folder(room: SyntheticRecording, tmp_pa
 def test_a_film_that_is_not_whole_takes_nothing_from_the_run(
     drive_bag: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gvo.viz.video._count_packets", lambda _: 0)
+    monkeypatch.setattr("gvo.viz.video.count_pictures", lambda _: 0)
     out = tmp_path / "out"
     options = ["--out", out, "--no-report", "--overlay", tmp_path / "film.webm"]
     answer = command("run", drive_bag, *options)
@@ -395,7 +395,7 @@ def test_all_files_that_are_not_whole_are_named(
         raise RecordingError("run.mcap: torn")
 
     monkeypatch.setattr(RunBag, "close", tear)
-    monkeypatch.setattr("gvo.viz.video._count_packets", lambda _: 0)
+    monkeypatch.setattr("gvo.viz.video.count_pictures", lambda _: 0)
     bag, film = tmp_path / "run.mcap", tmp_path / "film.webm"
     outputs = gvo.RunOutputs(bag=bag, overlay=film, report=False)
     result = gvo.run_recording(room, tmp_path / "out", outputs=outputs)

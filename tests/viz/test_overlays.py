@@ -20,11 +20,11 @@ from gvo.viz.overlay import (
     compose_faulty,
     compose_overlay,
     draw_matches,
-    loop_text,
     shortened,
     table,
     text_width,
 )
+from gvo.viz.scene import loop_text
 from tests.results import estimate_at, loop_of, result_of
 
 _GREY = np.random.default_rng(0).integers(60, 120, (80, 120), dtype=np.uint8)

@@ -42,7 +42,7 @@ the length of the run, not with its square; those at the end hold all poses.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from itertools import chain, count
@@ -67,25 +67,29 @@ from gvo.io.convert.bag_messages import (
 )
 from gvo.io.run_folder.line_file import PartFile
 from gvo.runs.outputs import bag_messages as messages
-from gvo.runs.outputs.frames import GLOBAL, ODOM, RunFrames, StampedPose, Track, twist_between
+from gvo.runs.outputs.frames import ODOM, RunFrames, twist_between
 from gvo.types import (
-    BoolArray,
     Estimate,
     FaultyFrame,
     FloatArray,
     Frame,
     FrameResult,
-    ImageArray,
-    Loop,
     Optimum,
     Status,
 )
-from gvo.viz.overlay import caption, draw_matches, placed_matches
+from gvo.viz.overlay import draw_matches
+from gvo.viz.scene import (
+    GLOBAL,
+    History,
+    Scene,
+    StampedPose,
+    grey_values,
+    placed_matches,
+    scene,
+)
+from gvo.viz.scene import Path as PosePath
 
 SUFFIXES: Final = (".mcap", ".bag")
-N_SHOWN_POSES: Final = 500
-"""Most poses of a path while the run goes."""
-
 _POINTS, _PICTURE = "/gvo/points", "/gvo/matches/compressed"
 TOPICS: Final = {
     "/tf": TF_TYPE,
@@ -115,14 +119,12 @@ class RunMessages:
 
     def __init__(self, writer: MessageWriter, frames: RunFrames) -> None:
         self._writer, self._frames = writer, frames
-        self._tracks = {name: Track() for name in ("raw", "smoothed", GLOBAL)}
-        self._causal = Track()
+        self._history = History()
         self._numbers = count()
         self._T_odom_base = np.eye(4)
         self._last: Estimate | None = None  # of the raw chain
         self._first_ns: int | None = None
         self._newest_ns = 0
-        self._n_seconds = 0
 
     @property
     def has_frames(self) -> bool:
@@ -131,50 +133,41 @@ class RunMessages:
 
     def restart_paths(self) -> None:
         """Forget the poses so far, as where the world is another one from now on."""
-        self._tracks = {name: Track() for name in self._tracks}
-        self._causal = Track()
+        self._history = History()
 
     def add_frame(self, frame: Frame, result: FrameResult) -> None:
-        """Write the result of a frame.
-
-        Parameters
-        ----------
-        frame : StereoFrame or RgbdFrame
-            Whose image the matches are drawn over.
-        result : FrameResult
-            Its poses are those of the base frame.
-        """
-        raw, causal = result.raw, result.causal
+        """Write the result of a frame, with poses of the base frame."""
         self._begin(frame.stamp_ns)
+        self._history.add(result)
+        seen = scene(result, self._history)
         self._write_odom(result)
-        self._write_tf([("raw", raw), ("causal", causal)])
-        covariance = self._step_covariance(result, raw)
-        self._write_odometry("raw", raw, self._tracks["raw"].before(raw.stamp_ns), covariance)
-        self._write_odometry("causal", causal, self._causal.before(causal.stamp_ns))
-        self._tracks["raw"].add(raw)
-        self._causal.add(causal)
-        self._last = raw
-        self._write_matches(frame, result)
-        self._write_loops("causal", self._causal, result.loops)
-        self._write_paths_of_second(frame.stamp_ns)
-        self.add_smoothed(result.finished)
+        self._write_tf(seen.poses.items())
+        self._write_odometry("raw", result.raw, self._step_covariance(result, result.raw))
+        self._write_odometry("causal", result.causal)
+        self._last = result.raw
+        self._write_matches(frame, result, seen)
+        if "loops" in seen.lines:
+            self._write_loops("causal", seen.lines["loops"])
+        self._write_paths(seen.paths)
+        self._write_late("smoothed", result.finished)
 
     def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
         """Write smoothed poses of the base frame that are final, in any order."""
-        self._add_late("smoothed", estimates)
+        estimates = tuple(estimates)
+        self._history.add_late("smoothed", estimates)
+        self._write_late("smoothed", estimates)
 
     def add_optimum(self, optimum: Optimum) -> None:
         """Write the global poses of the base frame, and the loops that count."""
-        self._add_late(GLOBAL, optimum.estimates)
-        self._write_loops(GLOBAL, self._tracks[GLOBAL], optimum.loops)
+        self._history.add_late(GLOBAL, optimum.estimates)
+        self._write_late(GLOBAL, optimum.estimates)
+        self._write_loops(GLOBAL, self._history.tracks[GLOBAL].lines(optimum.loops))
 
-    def _add_late(self, name: str, estimates: Iterable[Estimate]) -> None:
+    def _write_late(self, name: str, estimates: Iterable[Estimate]) -> None:
         estimates = sorted(estimates, key=lambda estimate: estimate.stamp_ns)
-        track = self._tracks[name]
         self._write_tf([(name, estimate) for estimate in estimates])
         for estimate in estimates:
-            self._write_odometry(name, estimate, track.before(estimate.stamp_ns))
-            track.add(estimate)
+            self._write_odometry(name, estimate)
 
     def add_faulty(self, frame: FaultyFrame) -> None:
         """Write a frame without a pose to the diagnostics."""
@@ -187,6 +180,7 @@ class RunMessages:
 
     def _begin(self, stamp_ns: int) -> None:
         """Note the stamp of a frame; at the first, write the static transforms."""
+        self._writer.header(Header(stamp_ns, ""))  # refuses a stamp that does not fit
         self._newest_ns = stamp_ns
         if self._first_ns is not None:
             return
@@ -212,11 +206,10 @@ class RunMessages:
         names = frames.odom, frames.base_by(ODOM)
         messages.write_odometry(self._writer, f"/gvo/{ODOM}/odometry", estimate, names, twist)
 
-    def _write_loops(self, name: str, track: Track, loops: Iterable[Loop]) -> None:
-        segments = track.segments(loops)
-        if len(segments) > 0:
+    def _write_loops(self, name: str, lines: FloatArray) -> None:
+        if len(lines) > 0:
             header, number = Header(self._newest_ns, self._frames.world), next(self._numbers)
-            messages.write_lines(self._writer, header, segments, name=name, number=number)
+            messages.write_lines(self._writer, header, lines, name=name, number=number)
 
     def _step_covariance(self, result: FrameResult, pose: Estimate) -> FloatArray | None:
         """Return the covariance (6, 6) of the last step to a pose by its registration, if known.
@@ -231,12 +224,9 @@ class RunMessages:
         return se3.transport_covariance(result.registration.covariance, mount)
 
     def _write_odometry(
-        self,
-        name: str,
-        estimate: Estimate,
-        previous: StampedPose | None,
-        step_covariance: FloatArray | None = None,
+        self, name: str, estimate: Estimate, step_covariance: FloatArray | None = None
     ) -> None:
+        previous = self._history.tracks[name].before(estimate.stamp_ns)
         messages.write_odometry(
             self._writer,
             f"/gvo/{name}/odometry",
@@ -245,35 +235,31 @@ class RunMessages:
             twist_between(estimate, previous, step_covariance),
         )
 
-    def _write_matches(self, frame: Frame, result: FrameResult) -> None:
+    def _write_matches(self, frame: Frame, result: FrameResult, seen: Scene) -> None:
         """Write diagnostics, points and picture of a frame; the last two where they are wanted."""
         hardware = Header(frame.stamp_ns, self._frames.camera)
-        text = " ".join(caption(result))
-        messages.write_diagnostics(self._writer, hardware, result.status, text, _numbers(result))
-        header = Header(frame.stamp_ns, self._frames.camera_by("causal"))
-        image, found = image_of(frame), placed_matches(result)
+        numbers, text = _numbers(result, seen.counts), " ".join(seen.caption)
+        messages.write_diagnostics(self._writer, hardware, result.status, text, numbers)
+        header, image = Header(frame.stamp_ns, self._frames.camera_by("causal")), image_of(frame)
         if self._writer.is_wanted(_POINTS):
-            intensities = _grey_values(image, found.pixels_current)
-            messages.write_points(self._writer, _POINTS, header, found, intensities)
+            greys = grey_values(image, seen.points.pixels)
+            messages.write_points(self._writer, _POINTS, header, seen.points, greys)
         if self._writer.is_wanted(_PICTURE):
+            found = placed_matches(result)
             matches = found.pixels_reference, found.pixels_current, found.inliers
-            picture = draw_matches(image, *matches, lines=caption(result))
+            picture = draw_matches(image, *matches, lines=seen.caption)
             write_picture(self._writer, _PICTURE, header, picture)
 
-    def _write_paths_of_second(self, stamp_ns: int) -> None:
-        """Write the paths where a new second of the recording has begun."""
-        n_seconds = (stamp_ns - (self._first_ns or 0)) // 10**9
-        if n_seconds > self._n_seconds:
-            self._n_seconds = n_seconds
-            self.write_paths(N_SHOWN_POSES)
+    def write_paths(self) -> None:
+        """Write the paths so far, of all poses."""
+        self._write_paths(self._history.paths())
 
-    def write_paths(self, n_most: int | None = None) -> None:
-        """Write the paths so far, of at most so many poses each; of all without a number."""
+    def _write_paths(self, paths: Mapping[str, PosePath]) -> None:
         header = Header(self._newest_ns, self._frames.world)
-        for name, track in self._tracks.items():
+        for name in ("raw", "smoothed", GLOBAL):
             topic = f"/gvo/{name}/path"
-            if len(track) > 0 and self._writer.is_wanted(topic):
-                messages.write_path(self._writer, topic, header, *track.poses(n_most))
+            if name in paths and self._writer.is_wanted(topic):
+                messages.write_path(self._writer, topic, header, *paths[name])
 
 
 class RunBag(AbstractContextManager["RunBag"]):
@@ -345,28 +331,13 @@ class RunBag(AbstractContextManager["RunBag"]):
         self.close()
 
 
-def _grey_values(image: ImageArray, pixels: FloatArray) -> FloatArray:
-    """Return the grey values (n,) of the nearest pixels; 0 outside the image."""
-    height, width = image.shape
-    u, v = np.rint(np.nan_to_num(pixels, nan=-1.0)).T
-    is_inside: BoolArray = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    values = np.zeros(len(pixels))
-    values[is_inside] = image[v[is_inside].astype(np.int64), u[is_inside].astype(np.int64)]
-    return values
-
-
-def _numbers(result: FrameResult) -> dict[str, object]:
+def _numbers(result: FrameResult, counts: dict[str, int]) -> dict[str, object]:
     """Return the values of the diagnostics."""
-    numbers: dict[str, object] = {
+    shown = ("keypoints", "points", "matches", "inliers", "links", "refused", "loops")
+    stages = {f"{stage} [ms]": f"{ms:.3f}" for stage, ms in result.stage_ms.items()}
+    return {
         "status": result.status,
         "status of the raw chain": result.raw.status,
-        "keypoints": result.n_keypoints,
-        "points": result.n_points,
-        "matches": result.n_matches,
-        "inliers": result.n_inliers,
-        "links": result.n_links,
-        "refused edges": len(result.causal.rejected),
-        "loops": len(result.loops),
+        **{"refused edges" if name == "refused" else name: counts[name] for name in shown},
+        **stages,
     }
-    stages = {f"{stage} [ms]": f"{ms:.3f}" for stage, ms in result.stage_ms.items()}
-    return {**numbers, **stages}

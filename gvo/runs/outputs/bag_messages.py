@@ -11,8 +11,9 @@ from gvo.geometry import se3
 from gvo.io.bag.topics import COMPRESSED_TYPE
 from gvo.io.convert.bag_messages import Header, MessageWriter, pose_numbers
 from gvo.runs.outputs.frames import Twist
-from gvo.types import Estimate, FloatArray, IntArray, RelativePose, Status
-from gvo.viz.palette import ESTIMATES
+from gvo.types import Estimate, FloatArray, ImageArray, IntArray, Status
+from gvo.viz.palette import DRAWN, rgb
+from gvo.viz.scene import Points
 
 ODOMETRY_TYPE: Final = "nav_msgs/msg/Odometry"
 PATH_TYPE: Final = "nav_msgs/msg/Path"
@@ -38,21 +39,7 @@ _LEVELS: Final = {
 
 
 def covariance_to_ros(covariance: FloatArray, R_parent_frame: FloatArray) -> FloatArray:
-    """Return the covariance of a pose as messages of ROS state it.
-
-    Parameters
-    ----------
-    covariance : ndarray of float64, shape (6, 6)
-        Of (rx, ry, rz, tx, ty, tz), right perturbation, in the frame.
-    R_parent_frame : ndarray of float64, shape (3, 3)
-        Rotation of the pose.
-
-    Returns
-    -------
-    ndarray of float64, shape (6, 6)
-        Of (x, y, z, rx, ry, rz): the position in the parent frame, and the rotation about the
-        fixed axes of the parent frame.
-    """
+    """Return (6, 6) of (x, y, z, rx, ry, rz) in the parent, of (rx, ..., tz) in the frame."""
     # Exchange the halves and turn both: with the inverse rotation, that is the way back.
     return se3.covariance_from_ros(covariance, R_parent_frame.T)
 
@@ -60,22 +47,7 @@ def covariance_to_ros(covariance: FloatArray, R_parent_frame: FloatArray) -> Flo
 def write_odometry(
     writer: MessageWriter, topic: str, estimate: Estimate, frames: tuple[str, str], twist: Twist
 ) -> None:
-    """Write a pose and a velocity with their covariances as `nav_msgs/Odometry`.
-
-    A covariance of the velocity that is not known has -1 on its diagonal.
-
-    Parameters
-    ----------
-    writer : MessageWriter
-    topic : str
-        Where to.
-    estimate : Estimate
-        Pose of the child frame in the parent frame.
-    frames : (str, str)
-        Parent and child.
-    twist : Twist
-        Of the child frame, in its own axes.
-    """
+    """Write a pose in the frames (parent, child), and the velocity of the child in its own axes."""
     parent, child = frames
     R = estimate.T_world_frame[:3, :3]
     message = writer.make(
@@ -95,20 +67,7 @@ def write_odometry(
 def write_path(
     writer: MessageWriter, topic: str, header: Header, stamps_ns: IntArray, poses: FloatArray
 ) -> None:
-    """Write poses as `nav_msgs/Path`.
-
-    Parameters
-    ----------
-    writer : MessageWriter
-    topic : str
-        Where to.
-    header : Header
-        Stamp of the message, and the frame of the poses.
-    stamps_ns : ndarray of int64, shape (n,)
-        Of the poses.
-    poses : ndarray of float64, shape (n, 7)
-        Position in metres and quaternion (x, y, z, w).
-    """
+    """Write poses (n, 7), positions and quaternions (x, y, z, w), with their stamps."""
     stamped = [
         writer.make(
             "geometry_msgs/msg/PoseStamped",
@@ -124,19 +83,8 @@ def write_path(
 def write_lines(
     writer: MessageWriter, header: Header, segments: FloatArray, *, name: str, number: int
 ) -> None:
-    """Write the lines of loops as a `visualization_msgs/Marker` to `/gvo/loops`.
-
-    Parameters
-    ----------
-    writer : MessageWriter
-    header : Header
-        Stamp, and the frame of the lines.
-    segments : ndarray of float64, shape (n, 2, 3)
-        Where each begins and ends, metres.
-    name, number : str, int
-        Namespace and id: another marker of both replaces this one.
-    """
-    red, green, blue = (value / 255 for value in bytes.fromhex(ESTIMATES["global"][1:]))
+    """Write lines (n, 2, 3) in metres; another marker of this name and number replaces it."""
+    red, green, blue = (value / 255 for value in rgb(DRAWN["loops"]))
     message = writer.make(
         MARKER_TYPE,
         header=writer.header(header),
@@ -175,30 +123,13 @@ def _untextured(writer: MessageWriter) -> dict[str, object]:
 
 
 def write_points(
-    writer: MessageWriter, topic: str, header: Header, found: RelativePose, intensities: FloatArray
+    writer: MessageWriter, topic: str, header: Header, points: Points, intensities: ImageArray
 ) -> None:
-    """Write matched points as an unorganised `sensor_msgs/PointCloud2`.
-
-    Its fields are x, y, z and intensity (FLOAT32), and inlier (UINT8, 0 or 1); points that are
-    not finite are left out.
-
-    Parameters
-    ----------
-    writer : MessageWriter
-    topic : str
-        Where to.
-    header : Header
-        Stamp, and the frame of the points.
-    found : RelativePose
-        Its n points, and which are inliers.
-    intensities : ndarray of float64, shape (n,)
-    """
-    points = found.points_current
-    is_finite = np.isfinite(points).all(axis=1)
-    cloud = np.zeros(int(np.count_nonzero(is_finite)), dtype=_POINT)
-    for name, values in zip("xyz", points[is_finite].T, strict=True):
+    """Write points with fields x, y, z, intensity (FLOAT32) and inlier (UINT8, 0 or 1)."""
+    cloud = np.zeros(len(points.points_cam), dtype=_POINT)
+    for name, values in zip("xyz", points.points_cam.T, strict=True):
         cloud[name] = values
-    cloud["intensity"], cloud["inlier"] = intensities[is_finite], found.inliers[is_finite]
+    cloud["intensity"], cloud["inlier"] = intensities, points.inliers
     message = writer.make(
         CLOUD_TYPE,
         header=writer.header(header),
@@ -223,25 +154,7 @@ def write_diagnostics(
     *,
     of: str = "odometry",
 ) -> None:
-    """Write the state of a frame, or of what frames come from, to `/diagnostics`.
-
-    Its level is OK for a frame registered to its predecessors, WARN where it coasts or has resumed,
-    ERROR where it is lost or was skipped.
-
-    Parameters
-    ----------
-    writer : MessageWriter
-    header : Header
-        Stamp of the frame, and what it was seen by: the hardware.
-    status : Status
-        Of the frame.
-    text : str
-        One line.
-    values : mapping of str to object
-        Numbers to show.
-    of : str
-        Its name.
-    """
+    """Write the state of a frame, or of what frames come from, to `/diagnostics`."""
     message = writer.make(
         "diagnostic_msgs/msg/DiagnosticStatus",
         level=_LEVELS[status],

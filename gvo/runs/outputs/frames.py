@@ -1,24 +1,19 @@
-"""Names of frames, and the poses so far."""
+"""Names of a run's frames, and velocities between poses."""
 
 from __future__ import annotations
 
-from array import array
-from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from gvo.geometry import se3
-from gvo.io.convert.bag_messages import FramePose, pose_numbers
+from gvo.io.convert.bag_messages import FramePose
 from gvo.io.poses.tf_paths import bare
-from gvo.types import Estimate, FloatArray, IntArray, Loop
+from gvo.types import Estimate, FloatArray
+from gvo.viz.scene import ESTIMATES, GLOBAL, StampedPose
 
-ESTIMATES: Final = ("raw", "causal", "smoothed")
-GLOBAL: Final = "global"
-"""The estimate that comes at the end of a run."""
 ODOM: Final = "odom"
 """The frame of REP 105 in which the base frame never jumps."""
 
@@ -137,16 +132,6 @@ class RunFrames:
         return FramePose(stamp_ns, parent, child, self.mount(stamp_ns))
 
 
-_N_NUMBERS = 7
-
-
-class StampedPose(NamedTuple):
-    """Stamp in nanoseconds and pose (4, 4) of a frame."""
-
-    stamp_ns: int
-    T_world_frame: FloatArray
-
-
 class Twist(NamedTuple):
     """A velocity of a moving frame, in its own axes.
 
@@ -158,77 +143,10 @@ class Twist(NamedTuple):
     covariance: FloatArray | None
 
 
-class Track:
-    """The poses of one estimate so far, 64 bytes each, in the order of their stamps."""
-
-    def __init__(self) -> None:
-        self._stamps_ns = array("q")
-        self._poses = array("d")
-
-    def __len__(self) -> int:
-        return len(self._stamps_ns)
-
-    def add(self, estimate: Estimate) -> None:
-        """Take the next pose, in any order of stamps."""
-        index = bisect_right(self._stamps_ns, estimate.stamp_ns)
-        self._stamps_ns.insert(index, estimate.stamp_ns)
-        numbers = pose_numbers(estimate.T_world_frame).tolist()
-        self._poses[_N_NUMBERS * index : _N_NUMBERS * index] = array("d", numbers)
-
-    def before(self, stamp_ns: int) -> StampedPose | None:
-        """Return stamp and pose (4, 4) of the latest pose before a stamp."""
-        index = bisect_left(self._stamps_ns, stamp_ns) - 1
-        if index < 0:
-            return None
-        numbers = np.array(self._poses[_N_NUMBERS * index : _N_NUMBERS * (index + 1)])
-        R = np.asarray(Rotation.from_quat(numbers[3:]).as_matrix())
-        return StampedPose(self._stamps_ns[index], se3.make_transform(R, numbers[:3]))
-
-    def at(self, stamp_ns: int) -> FloatArray | None:
-        """Return the pose (4, 4) at a stamp, if there is one."""
-        pose = self.before(stamp_ns + 1)
-        return pose.T_world_frame if pose is not None and pose.stamp_ns == stamp_ns else None
-
-    def segments(self, loops: Iterable[Loop]) -> FloatArray:
-        """Return lines (n, 2, 3) from frame to reference of those loops that count."""
-        counting = [loop for loop in loops if not loop.reason]
-        ends = [(self.at(loop.stamp_ns), self.at(loop.reference_ns)) for loop in counting]
-        known = [
-            [T[:3, 3], T_reference[:3, 3]]
-            for T, T_reference in ends
-            if T is not None and T_reference is not None
-        ]
-        return np.array(known).reshape(-1, 2, 3)
-
-    def poses(self, n_most: int | None = None) -> tuple[IntArray, FloatArray]:
-        """Return stamps (n,) and positions with quaternions (n, 7).
-
-        Of more than `n_most`, every second, fourth, ... and the last are taken: those shown stay
-        the same while the track grows.
-        """
-        stride = 1
-        while n_most is not None and stride * (n_most - 1) < len(self) > n_most:
-            stride *= 2
-        is_shown = np.arange(len(self)) % stride == 0
-        is_shown[-1:] = True
-        stamps_ns = np.frombuffer(self._stamps_ns, dtype=np.int64)
-        return stamps_ns[is_shown], np.frombuffer(self._poses).reshape(-1, _N_NUMBERS)[is_shown]
-
-
 def twist_between(
     estimate: Estimate, previous: StampedPose | None, step_covariance: FloatArray | None
 ) -> Twist:
-    """Return the velocity that leads from the pose before to this one.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        The later pose.
-    previous : StampedPose or None
-        The earlier one; without it the velocity is 0, of unknown covariance.
-    step_covariance : ndarray of float64, shape (6, 6), or None
-        Of the step between the two, (rx, ry, rz, tx, ty, tz), in the later frame.
-    """
+    """Return the velocity from the pose before to this one; 0 where none was."""
     if previous is None:
         return Twist(velocity=np.zeros(6), covariance=None)
     elapsed_s = 1e-9 * (estimate.stamp_ns - previous.stamp_ns)

@@ -50,7 +50,7 @@ class RunOverlay(AbstractContextManager["RunOverlay"]):
     ConfigurationError
         When the path ends otherwise.
     RecordingError
-        When the path exists or cannot be written.
+        When the path exists or cannot be written; so do all methods.
     """
 
     def __init__(self, path: str | Path, camera: PinholeCamera) -> None:
@@ -65,23 +65,11 @@ class RunOverlay(AbstractContextManager["RunOverlay"]):
         self._waiting: deque[Future[None]] = deque()
 
     def add_frame(self, frame: Frame, result: FrameResult) -> None:
-        """Take a frame and its result.
-
-        Raises
-        ------
-        RecordingError
-            When an earlier one could not be written.
-        """
+        """Take a frame and its result."""
         self._put((frame, result))
 
     def add_faulty(self, frame: FaultyFrame) -> None:
-        """Take a frame without a pose; its picture says why.
-
-        Raises
-        ------
-        RecordingError
-            When an earlier one could not be written.
-        """
+        """Take a frame without a pose; its picture says why."""
         self._put(frame)
 
     def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
@@ -91,13 +79,7 @@ class RunOverlay(AbstractContextManager["RunOverlay"]):
         """Take the global poses, which the film does not show."""
 
     def close(self) -> None:
-        """Write what waits and finish the film; a second call does nothing.
-
-        Raises
-        ------
-        RecordingError
-            When it cannot be written.
-        """
+        """Write what waits and finish the film; a second call does nothing."""
         if not self._is_open:
             return
         self._is_open = False

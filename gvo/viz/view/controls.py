@@ -48,16 +48,8 @@ class _Control:
 class ParameterControls:
     """A control for every parameter, in folders by section.
 
-    Parameters
-    ----------
-    gui : viser.GuiApi
-        Where they are added.
-    config : Config
-        Shown at first.
-    apply : callable
-        Called with each new configuration; raises `ConfigurationError` to refuse it.
-    say : callable
-        Called with one line on what was refused; with an empty one once values are valid.
+    `apply` is called with each new configuration and raises `ConfigurationError` to refuse it;
+    `say` with one line on what was refused, and with an empty one once values are valid.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Plays odometry over a recording, forward as it is computed and backward as it was; or a run."""
+"""Plays odometry over a recording, as it is computed."""
 
 from __future__ import annotations
 
@@ -8,21 +8,14 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from functools import partial
-from typing import TypeAlias
-
-import numpy as np
 
 from gvo.config import Config
 from gvo.errors import GvoError
-from gvo.io.excerpt import Excerpt
 from gvo.io.frames import one_opencv_thread
 from gvo.io.recording import Source
-from gvo.types import IntArray
-from gvo.viz.view.history import FrameView, History
+from gvo.viz.view.newest import Newest
 from gvo.viz.view.tracking import OpenSource, Tracking
 
-Subscriber: TypeAlias = Callable[[FrameView], None]
 _LOGGER = logging.getLogger(__name__)
 
 # A gap of the stamps is not waited for longer, seconds of the recording.
@@ -30,11 +23,10 @@ _MAX_GAP_S = 1.0
 
 
 class Player(AbstractContextManager["Player"]):
-    """Runs odometry over a recording on a thread of its own.
+    """Runs odometry over a recording on a thread of its own, forward.
 
-    Nothing is computed before `play`, `step` or `seek`. Frames that were computed are shown again
-    as they were; odometry is never rewound. All methods may be called from any thread and return
-    at once; what they ask for begins after the frame under way.
+    Nothing is computed before `play`, `step` or `restart`. All methods may be called from any
+    thread and return at once; what they ask for begins after the frame under way.
 
     Parameters
     ----------
@@ -42,15 +34,13 @@ class Player(AbstractContextManager["Player"]):
         Opens the recording with a configuration; called again by `restart`, and where parameters
         of reading change (`sync`, `images`, `runtime`, `depth.scale`).
     config : Config
-    excerpt : Excerpt, optional
-        The part that is played; the whole recording where omitted.
 
     Attributes
     ----------
     config : Config
         Of the next frame.
-    history : History
-        The frames since the start or the last restart.
+    newest : Newest
+        The newest frame, and the history since the start or the last restart.
     is_playing : bool
         Frames follow by themselves.
     is_finished : bool
@@ -68,32 +58,27 @@ class Player(AbstractContextManager["Player"]):
     >>> from gvo.io.synthetic import SyntheticRecording
     >>> recording = SyntheticRecording("handheld", "rgbd", n_frames=3, scale=0.25)
     >>> with Player(lambda config: recording, Config()) as player:
-    ...     player.seek(2)
-    ...     player.wait(), player.index, len(player.history.path("raw")[0])
-    (True, 2, 3)
+    ...     player.set_speed(None)
+    ...     player.play()
+    ...     player.wait(), player.newest.n_done
+    (True, 3)
     """
 
-    def __init__(
-        self, open_source: OpenSource, config: Config, *, excerpt: Excerpt | None = None
-    ) -> None:
+    def __init__(self, open_source: OpenSource, config: Config) -> None:
         self._open_source = open_source
-        self._excerpt = excerpt or Excerpt()
-        self._tracking = Tracking(open_source, config, self._excerpt)
-        self.history = History()
+        self._tracking = Tracking(open_source, config)
         # Guards all below and wakes the thread.
         self._changed = threading.Condition()
         self.config = config
         self._speed: float | None = 1.0
         self.is_playing = False
-        self._is_stepping = False
-        self._goal: int | None = None
+        self._n_steps = 0
         self._restart_index: int | None = None
         self._is_closed = False
         self._is_working = False
         self.is_finished = False
         self.fault = ""
         self._due_s = -math.inf  # when the frame shown was due, by the clock of `monotonic`
-        self._subscribers: list[Subscriber] = []
         self._thread = threading.Thread(target=self._work, name="player", daemon=True)
         self._thread.start()
 
@@ -104,38 +89,22 @@ class Player(AbstractContextManager["Player"]):
             yield
             self._changed.notify_all()
 
-    # Commands
-
     def play(self) -> None:
-        """Go on from the frame shown, at the speed that is set."""
+        """Go on, at the speed that is set."""
         with self._changing():
             self.is_playing = True
             self._due_s = -math.inf
 
     def pause(self) -> None:
-        """Stop, also on the way to a frame."""
+        """Stop after the frame under way."""
         with self._changing():
-            self.is_playing = self._is_stepping = False
-            self._goal = None
+            self.is_playing, self._n_steps = False, 0
 
     def step(self) -> None:
-        """Show the next frame and pause; calls add up."""
+        """Track the next frame and pause; calls add up."""
         with self._changing():
-            base = self._goal if self._is_stepping and self._goal is not None else self.index
-            self._goal = base + 1
-            self._is_stepping, self.is_playing = True, False
-
-    def seek(self, index: int) -> None:
-        """Show a frame, as soon as all frames up to it are computed; playing goes on from there.
-
-        Parameters
-        ----------
-        index : int
-            Of the frame in the recording; clipped to the first and the last one.
-        """
-        with self._changing():
-            self._goal = max(int(index), self.first_index)
-            self._is_stepping = False
+            self.is_playing = False
+            self._n_steps += 1
 
     def set_speed(self, factor: float | None) -> None:
         """Play by the recording's stamps, or as fast as possible; no frame is left out.
@@ -160,55 +129,18 @@ class Player(AbstractContextManager["Player"]):
 
         Where the recording must be opened again for it and cannot be, `fault` tells why and the
         former configuration stays.
-
-        Raises
-        ------
-        ValueError
-            When it is no Config.
         """
-        if not isinstance(config, Config):
-            raise ValueError(f"config must be a gvo.Config, got {type(config).__name__}")
         with self._changing():
             self.config, self.fault = config, ""
 
-    def restart(self, index: int | None = None) -> None:
-        """Drop what was computed and begin anew, with the present configuration.
+    def restart(self, index: int = 0) -> None:
+        """Begin anew at a frame of the recording, with the present configuration.
 
-        The first frame that is tracked is the world; frames keep their numbers.
-
-        Parameters
-        ----------
-        index : int, optional
-            First frame: 0, or one that is done; the one that is shown where omitted.
-
-        Raises
-        ------
-        ValueError
-            When the frame is not known yet.
+        It is the world, and is shown; frames keep their numbers. Where there is no such frame,
+        `fault` tells so and nothing changes.
         """
         with self._changing():
-            index = max(self.index, 0) if index is None else int(index)
-            if index != 0 and not self.first_index <= index < self.n_done:
-                raise ValueError(f"frame {index} is not known: {self.n_done} are done")
-            self._restart_index = index
-            self._goal, self._is_stepping = None, False
-
-    def subscribe(self, callback: Subscriber) -> Callable[[], None]:
-        """Call back with each frame that is shown, on the thread of the player.
-
-        Returns
-        -------
-        callable
-            Unsubscribes.
-        """
-        with self._changed:
-            self._subscribers.append(callback)
-        return partial(self._unsubscribe, callback)
-
-    def _unsubscribe(self, callback: Subscriber) -> None:
-        with self._changed:
-            if callback in self._subscribers:
-                self._subscribers.remove(callback)
+            self._restart_index, self._n_steps = max(int(index), 0), 0
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait until nothing is left to do; False on timeout."""
@@ -216,7 +148,7 @@ class Player(AbstractContextManager["Player"]):
             return self._changed.wait_for(lambda: not self.is_busy, timeout_s)
 
     def close(self) -> None:
-        """End the thread after the frame under way; the history can still be read."""
+        """End the thread after the frame under way."""
         with self._changing():
             self._is_closed = True
         if threading.current_thread() is not self._thread:
@@ -226,29 +158,16 @@ class Player(AbstractContextManager["Player"]):
         """Close it."""
         self.close()
 
-    # State
+    @property
+    def newest(self) -> Newest:
+        """The newest frame, and what led to it."""
+        return self._tracking.newest
 
     @property
     def n_frames(self) -> int:
         """Frames that the recording announces; those that were read, once it is finished."""
-        if self.is_finished:
-            return self.n_done
-        return max(self._excerpt.n_expected(self.source.info.n_images), self.n_done)
-
-    @property
-    def n_done(self) -> int:
-        """Frames that are done: the index of the last one, and 1."""
-        return self.history.n_done
-
-    @property
-    def index(self) -> int:
-        """Index of the frame shown; one less than `first_index` before there is any."""
-        return self.history.shown
-
-    @property
-    def first_index(self) -> int:
-        """Where odometry began."""
-        return self.history.first_index
+        n_done = self.newest.n_done
+        return n_done if self.is_finished else max(self.source.info.n_images, n_done)
 
     @property
     def is_busy(self) -> bool:
@@ -262,12 +181,6 @@ class Player(AbstractContextManager["Player"]):
         """The recording."""
         return self._tracking.source
 
-    @property
-    def frame_view(self) -> FrameView | None:
-        """The frame shown; None before there is any."""
-        history = self.history
-        return history.frame_view() if history.shown >= history.first_index else None
-
     # On the thread
 
     def _work(self) -> None:
@@ -275,9 +188,7 @@ class Player(AbstractContextManager["Player"]):
             while self._wait_for_work():
                 if not self._guarded(self._turn):
                     with self._changed:
-                        self.is_playing = self._is_stepping = False
-                        self._goal = self._restart_index = None
-                    self._publish()
+                        self.is_playing, self._n_steps, self._restart_index = False, 0, None
         self._guarded(self._tracking.close)
 
     def _wait_for_work(self) -> bool:
@@ -289,7 +200,7 @@ class Player(AbstractContextManager["Player"]):
             self._is_working = not self._is_closed
             return self._is_working
 
-    def _guarded(self, work: Callable[[], None]) -> bool:
+    def _guarded(self, work: Callable[[], object]) -> bool:
         """Call; keep an error as `fault`: the thread must go on."""
         try:
             work()
@@ -302,50 +213,26 @@ class Player(AbstractContextManager["Player"]):
             return True
         return False
 
-    def _publish(self) -> None:
-        """Tell all subscribers of the frame shown."""
-        with self._changed:
-            subscribers = tuple(self._subscribers)
-        view = self.frame_view if subscribers else None
-        if view is not None:
-            for callback in subscribers:
-                self._guarded(partial(callback, view))
-
     def _turn(self) -> None:
-        """Carry out one command: start anew, or show or compute one frame."""
+        """Carry out one command: start anew, or track one frame."""
         with self._changed:
-            restart_index, goal = self._restart_index, self._goal
+            restart_index, is_stepping = self._restart_index, self._n_steps > 0
+            self._restart_index = None
+            if restart_index is None and is_stepping:
+                self._n_steps -= 1
         if restart_index is not None:
             self._start_anew(restart_index)
-        elif goal is not None:
-            self._approach(goal)
-        elif self._wait_until_due() and not self._show_next():
+        elif (is_stepping or self._wait_until_due()) and not self._advance():
             with self._changed:
-                self.is_playing = False
+                self.is_playing, self._n_steps = False, 0
 
     def _start_anew(self, index: int) -> None:
-        from_ns = None if index == 0 else self.history.stamp_ns(index)
-        tracking = Tracking(self._open_source, self.config, self._excerpt, from_ns=from_ns)
+        tracking = Tracking(self._open_source, self.config, index)
         self._tracking.close()
         with self._changed:
-            self._tracking, self.history = tracking, History(index)
+            self._tracking = tracking
             self.is_finished, self.fault = False, ""
-            if self._restart_index == index:
-                self._restart_index = None
-            if self._goal is None:
-                self._goal = index
-
-    def _approach(self, goal: int) -> None:
-        """Show a frame, or the next one on the way to it."""
-        if goal < self.n_done:
-            self._show(goal)
-        elif not self._advance() and self.index < self.n_done - 1:
-            self._show(self.n_done - 1)
-        with self._changed:
-            is_arrived = self.index == goal or self.is_finished
-            if is_arrived and self._goal == goal:  # not another one by now
-                self._goal, self._is_stepping = None, False
-            self._due_s = time.monotonic()
+        self._advance()
 
     def _wait_until_due(self) -> bool:
         """Wait until the next frame is due; False where another command came."""
@@ -362,46 +249,27 @@ class Player(AbstractContextManager["Player"]):
         return False
 
     def _is_asked(self) -> bool:
-        return self._goal is not None or self._restart_index is not None
+        return self._n_steps > 0 or self._restart_index is not None
 
     def _gap_s(self) -> float:
-        """Return how long after the frame shown the next one was recorded."""
-        if self.index < self.first_index:
+        """Return how long after the newest frame the next one was recorded."""
+        item, last_ns = self._tracking.peek(), self._tracking.last_ns
+        if item is None or last_ns is None:
             return 0.0
-        if self.index + 1 < self.n_done:
-            next_ns = self.history.stamp_ns(self.index + 1)
-        elif (item := self._tracking.peek()) is not None:
-            next_ns = item.stamp_ns
-        else:
-            return 0.0
-        gap_s = 1e-9 * (next_ns - self.history.stamp_ns(self.index))
-        return min(max(gap_s, 0.0), _MAX_GAP_S)
-
-    def _show_next(self) -> bool:
-        if self.index + 1 < self.n_done:
-            self._show(self.index + 1)
-            return True
-        return self._advance()
-
-    def _show(self, index: int) -> None:
-        self.history.show(index)
-        self._publish()
+        return min(max(1e-9 * (item.stamp_ns - last_ns), 0.0), _MAX_GAP_S)
 
     def _advance(self) -> bool:
-        """Compute and show the next frame; return False at the end."""
+        """Track and show the next frame; return False at the end."""
         if self.is_finished:
             return False
         try:
             self._take_configuration()
-            record = self._tracking.advance(self.n_done)
-            if record is not None:
-                self.history.add(record)
-                self._show(self.n_done - 1)
-                self._tracking.peek()  # is it the last one?
+            is_tracked = self._tracking.advance()
+            self._tracking.peek()  # is it the last one?
         finally:
             if self._tracking.is_finished:
                 self._finish()
-        return record is not None
+        return is_tracked
 
     def _take_configuration(self) -> None:
         config = self.config
@@ -418,106 +286,5 @@ class Player(AbstractContextManager["Player"]):
     def _finish(self) -> None:
         """Add the smoothed poses of the frames that the window still holds."""
         self.is_finished = True
-        if self.n_done > self.first_index:
-            self.history.finish(self._tracking.finish())
-            self._publish()
-
-
-class RunPlayer:
-    """Plays frames by their stamps.
-
-    Parameters
-    ----------
-    stamps_ns : ndarray of int64, shape (n,)
-        Of the frames, nanoseconds.
-    show : callable
-        Called with the index of each frame to be shown.
-    period_s : float
-        How often it looks whether the next frame is due.
-
-    Attributes
-    ----------
-    index : int
-        Frame that is shown.
-    is_playing : bool
-        Frames follow by themselves.
-    """
-
-    def __init__(
-        self, stamps_ns: IntArray, show: Callable[[int], None], *, period_s: float = 0.02
-    ) -> None:
-        self._stamps_ns, self._period_s, self._show = stamps_ns, period_s, show
-        self._lock = threading.RLock()
-        self.index = 0
-        self.is_playing = False
-        self._speed: float | None = 1.0
-        self._ahead_ns = 0.0
-        self._is_closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="gvo run player", daemon=True)
-        self._thread.start()
-
-    @property
-    def n_frames(self) -> int:
-        """Number of frames."""
-        return len(self._stamps_ns)
-
-    def play(self) -> None:
-        """Let frames follow by themselves; from the end, begin again."""
-        with self._lock:
-            if self.index >= self.n_frames - 1:
-                self.seek(0)
-            self._ahead_ns = 0.0
-            self.is_playing = True
-
-    def pause(self) -> None:
-        """Stay at the frame."""
-        self.is_playing = False
-
-    def step(self) -> None:
-        """Show the next frame and pause."""
-        self.pause()
-        self.seek(self.index + 1)
-
-    def seek(self, index: int) -> None:
-        """Show a frame; the index is clipped."""
-        with self._lock:
-            self.index = int(np.clip(index, 0, max(0, self.n_frames - 1)))
-            self._ahead_ns = 0.0
-            self._show(self.index)
-
-    def set_speed(self, factor: float | None) -> None:
-        """Play as recorded (1), faster, slower, or frame by frame without waiting (None)."""
-        self._speed = factor
-
-    def advance(self, elapsed_s: float) -> None:
-        """Play on by some time."""
-        with self._lock:
-            if not self.is_playing:
-                return
-            if self._speed is None:
-                self.seek(self.index + 1)
-            else:
-                self._advance_by(1e9 * elapsed_s * self._speed)
-            if self.index >= self.n_frames - 1:
-                self.is_playing = False
-
-    def _advance_by(self, span_ns: float) -> None:
-        ahead_ns = self._ahead_ns + span_ns
-        now_ns = int(self._stamps_ns[self.index]) + int(ahead_ns)
-        index = int(np.searchsorted(self._stamps_ns, now_ns, side="right")) - 1
-        if index > self.index:
-            self.seek(index)
-            ahead_ns = float(now_ns - int(self._stamps_ns[index]))
-        self._ahead_ns = ahead_ns
-
-    def close(self) -> None:
-        """End the thread."""
-        self._is_closing.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        before = time.monotonic()
-        while not self._is_closing.wait(self._period_s):
-            now = time.monotonic()
-            self.advance(now - before)
-            before = now
+        if self.newest.n_done > self.newest.first_index:
+            self.newest.finish(self._tracking.finish())

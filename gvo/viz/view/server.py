@@ -34,10 +34,8 @@ class LocalServer(viser.ViserServer):
 class ViewServer(AbstractContextManager["ViewServer"]):
     """A page that is being served, until it is closed.
 
-    Parameters
+    Attributes
     ----------
-    server : viser.ViserServer
-        Already listening.
     note : str
         One line where another port than the one asked for is used, else empty.
     """
@@ -80,13 +78,7 @@ class ViewServer(AbstractContextManager["ViewServer"]):
 
 
 def open_server(host: str, port: int, *, title: str) -> ViewServer:
-    """Bind and listen.
-
-    Raises
-    ------
-    ConfigurationError
-        Where the address is not of this machine, or no port is free.
-    """
+    """Bind and listen, or raise `ConfigurationError`."""
     free = find_port(host, port)
     with _silence(), _refusing_strangers(is_local=_is_loopback(host)):
         server = LocalServer(host=host, port=free, label=title, verbose=False)
@@ -97,19 +89,7 @@ def open_server(host: str, port: int, *, title: str) -> ViewServer:
 
 
 def is_own_page(origin: str | None, host: str, *, is_local: bool) -> bool:
-    """Tell whether a connection comes from this page, not from another one in the browser.
-
-    Browsers let any page connect to this machine, and name its origin.
-
-    Parameters
-    ----------
-    origin : str or None
-        As the browser says; None from other programs.
-    host : str
-        Name and port of the request.
-    is_local : bool
-        Accept names of this machine alone, also for the page itself: DNS may lead others here.
-    """
+    """Tell whether the origin that a browser names is this page; a local one has local names."""
     try:
         page = urlsplit(f"//{host}" if origin is None else origin)
         name = page.hostname or ""
@@ -149,13 +129,7 @@ def _refusing_strangers(*, is_local: bool) -> Iterator[None]:
 
 
 def find_port(host: str, port: int) -> int:
-    """Return the first free port from the given one; 0 stands for any.
-
-    Raises
-    ------
-    ConfigurationError
-        As for `open_server`.
-    """
+    """Return the first free port from the given one; 0 stands for any."""
     last = min(port + N_PORTS, 65536)
     for candidate in range(port, last):
         problem = _try_port(host, candidate)

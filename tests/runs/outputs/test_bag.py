@@ -24,7 +24,7 @@ from gvo.io.poses.tf import TfBuffer
 from gvo.io.recording import Sensor
 from gvo.io.synthetic import SyntheticRecording
 from gvo.odometry.odometry import Odometry
-from gvo.runs.outputs.bag import N_SHOWN_POSES, RunBag
+from gvo.runs.outputs.bag import RunBag
 from gvo.runs.outputs.frames import RunFrames
 from gvo.types import (
     Estimate,
@@ -37,6 +37,7 @@ from gvo.types import (
     Status,
     StereoFrame,
 )
+from gvo.viz.scene import N_SHOWN_POSES
 from tests.recordings import frames_of
 from tests.results import estimate_at, loop_of, optimum_of, result_of
 

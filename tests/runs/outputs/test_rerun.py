@@ -23,6 +23,7 @@ if os.environ.get("CI") != "true":
 import rerun as rr
 from rerun.chunk import RrdReader
 
+import gvo.viz.scene as drawn
 from gvo.config import Config
 from gvo.errors import GvoError, RecordingError
 from gvo.geometry.camera import StereoCamera
@@ -31,7 +32,6 @@ from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.run_folder.writer import RunFolder
 from gvo.io.synthetic import SyntheticRecording
 from gvo.runs.loop import RunLoop
-from gvo.runs.outputs import rerun_writer as rerun_run
 from gvo.runs.outputs.frames import RunFrames
 from gvo.runs.outputs.rerun import RunRerun
 from gvo.trajectory.formats import read_trajectory
@@ -386,7 +386,7 @@ def test_a_placed_camera_tells_where_up_is(tmp_path: Path, down: str, axes: list
     twist=st.lists(st.floats(-2.0, 2.0), min_size=6, max_size=6),
 )
 def test_any_covariance_gives_its_ellipsoid(numbers: list[float], twist: list[float]) -> None:
-    from gvo.runs.outputs.rerun_writer import make_ellipsoids
+    from gvo.runs.outputs.rerun import _ellipsoids as make_ellipsoids
 
     A = np.array(numbers).reshape(6, 6)
     estimate = Estimate(stamp_ns=0, T_world_frame=exp(np.array(twist)), covariance=A @ A.T)
@@ -527,7 +527,7 @@ def test_path_and_recent_poses_are_all_there_were_at_each_frame(tmp_path: Path) 
 
 
 def test_paths_on_the_way_are_thinned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rerun_run, "N_SHOWN_POSES", 10)
+    monkeypatch.setattr(drawn, "N_SHOWN_POSES", 10)
     places = [make_transform(np.eye(3), np.array([float(k), 0.0, 0.0])) for k in range(60)]
     results = [_made(k * _SECOND_NS, T) for k, T in enumerate(places)]
     rows = _write_made(tmp_path, results).rows["/world/causal/path"]

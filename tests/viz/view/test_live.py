@@ -1,7 +1,6 @@
 """A run that goes on elsewhere, on the page: the newest frame wins, and nothing waits for it."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,38 +11,28 @@ import numpy as np
 import pytest
 
 from gvo.config import Config
-from gvo.geometry.camera import Calibration, PinholeCamera, StereoCamera
+from gvo.geometry.camera import Calibration, PinholeCamera
 from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.live.odometry import LiveOdometry
 from gvo.live.transport import Parameters
 from gvo.runs.outputs.options import RunOutputs
-from gvo.types import Estimate, FaultyFrame, FrameResult, Loop, Status, StereoFrame
-from gvo.viz.view import live
-from gvo.viz.view.live import LiveHistory, LivePlayer
+from gvo.types import FaultyFrame
+from gvo.viz.view.live import LivePlayer
+from gvo.viz.view.newest import FrameView
 from gvo.viz.view.page import Page
 from gvo.viz.view.player import Player
 from gvo.viz.view.server import ViewServer
 from tests.recordings import Held
-from tests.viz.view.fakes import PERIOD_NS, cells, pose_of, result_of
-
-STEREO = StereoCamera(width=160, height=120, fx=120.0, fy=120.0, cx=80.0, cy=60.0, baseline=0.1)
-
-
-class FakeWindow:
-    """Holds the newest poses, and knows how often it was asked."""
-
-    def __init__(self) -> None:
-        self.stamps_ns: list[int] = []
-        self.n_asked = 0
-
-    def __contains__(self, stamp_ns: int) -> bool:
-        return stamp_ns in self.stamps_ns
-
-    def estimate(self, stamp_ns: int) -> Estimate:
-        self.n_asked += 1
-        T = pose_of(stamp_ns // PERIOD_NS)
-        T[0, 3] = 0.5
-        return Estimate(stamp_ns=stamp_ns, T_world_frame=T, covariance=np.eye(6))
+from tests.viz.view.fakes import (
+    CAMERA,
+    PERIOD_NS,
+    FakeWindow,
+    cells,
+    frame_of,
+    loop_between,
+    pose_of,
+    result_of,
+)
 
 
 @pytest.fixture
@@ -53,7 +42,7 @@ def window() -> FakeWindow:
 
 @pytest.fixture
 def player(window: FakeWindow) -> LivePlayer:
-    source = SimpleNamespace(info=SimpleNamespace(camera=STEREO, name="drive"))
+    source = SimpleNamespace(info=SimpleNamespace(camera=CAMERA, name="drive"))
     opened = LivePlayer(cast(Any, source), Parameters(Config()))
     opened.begin(cast(Any, window))
     return opened
@@ -66,34 +55,37 @@ def page(view: ViewServer, player: LivePlayer) -> Iterator[Page]:
     opened.close()
 
 
-def add(player: LivePlayer, window: FakeWindow, index: int) -> None:
-    result = result_of(index)
-    window.stamps_ns = [*window.stamps_ns[-2:], result.stamp_ns]
-    grey = np.full((STEREO.height, STEREO.width), index, dtype=np.uint8)
-    player.add(StereoFrame(stamp_ns=result.stamp_ns, left=grey, right=grey), result)
+def add(player: LivePlayer, window: FakeWindow, index: int, **changes: Any) -> None:
+    window.take(PERIOD_NS * index)
+    player.add(frame_of(index), result_of(index, **changes))
+
+
+def shown(player: LivePlayer) -> FrameView:
+    view = player.newest.view()
+    assert view is not None
+    return view
 
 
 def test_the_newest_frame_is_shown_with_all_paths(player: LivePlayer, window: FakeWindow) -> None:
-    assert player.frame_view is None
+    assert player.newest.view() is None
     for index in range(5):
         add(player, window, index)
-    view = player.frame_view
-    assert view is not None
+    view = shown(player)
     assert (view.index, player.n_frames) == (4, 5)
     np.testing.assert_array_equal(view.T_world_frame, pose_of(4))
-    assert {*view.window_poses} == {PERIOD_NS * index for index in (2, 3, 4)}
-    for path in (player.history.path("raw"), player.history.path("causal")):
-        np.testing.assert_array_equal(path[1][:, 2], np.arange(5.0))
-    np.testing.assert_array_equal(player.history.path("smoothed")[1][:, 0], [0.5] * 5)
-    assert player.frame_view is view
+    assert view.scene is not None
+    assert [each.stamp_ns for each in view.scene.window] == [PERIOD_NS * k for k in (2, 3, 4)]
+    for name, x in (("raw", 0.0), ("causal", 0.0), ("smoothed", 0.5)):
+        np.testing.assert_allclose(view.paths[name][1][:, 2], np.arange(5.0))
+        np.testing.assert_allclose(view.paths[name][1][:, 0], x)
+    assert player.newest.view() is view
 
 
 def test_a_faulty_frame_is_shown_at_the_last_pose(player: LivePlayer, window: FakeWindow) -> None:
     add(player, window, 0)
     add(player, window, 1)
     player.add(FaultyFrame(stamp_ns=2 * PERIOD_NS, reason="dropped"), None)
-    view = player.frame_view
-    assert view is not None
+    view = shown(player)
     assert (view.index, view.result, view.reason) == (2, None, "dropped")
     np.testing.assert_array_equal(view.T_world_frame, pose_of(1))
 
@@ -101,22 +93,17 @@ def test_a_faulty_frame_is_shown_at_the_last_pose(player: LivePlayer, window: Fa
 def test_while_it_is_paused_or_nobody_looks_only_poses_are_noted(
     player: LivePlayer, window: FakeWindow
 ) -> None:
-    told: list[object] = []
-    player.subscribe(told.append)
     add(player, window, 0)
-    assert len(told) == 1
     n_asked = window.n_asked
     player.pause()
     add(player, window, 1)
     player.play()
     player.is_watched = lambda: False
     add(player, window, 2)
-    assert len(told) == 1
     assert window.n_asked == n_asked
-    view = player.frame_view
-    assert view is not None
+    view = shown(player)
     assert view.index == 0
-    assert len(player.history.path("causal")[0]) == 3
+    assert len(view.paths["causal"][0]) == 3
 
 
 def test_a_new_run_begins_without_former_paths(player: LivePlayer, window: FakeWindow) -> None:
@@ -124,42 +111,33 @@ def test_a_new_run_begins_without_former_paths(player: LivePlayer, window: FakeW
     add(player, window, 1)
     player.begin(cast(Any, window))
     add(player, window, 2)
-    assert (player.first_index, player.n_done) == (2, 3)
-    assert len(player.history.path("causal")[0]) == 1
+    assert (player.newest.first_index, player.n_frames) == (2, 3)
+    assert len(shown(player).paths["causal"][0]) == 1
 
 
-def test_a_long_path_keeps_its_shape_in_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "_N_POSES", 64)
-    history = LiveHistory()
-    for index in range(1000):
-        history.add(result_of(index))
-    stamps_ns, positions = history.path("causal")
-    assert 32 <= len(stamps_ns) <= 64
-    np.testing.assert_array_equal(positions[:, 2], stamps_ns / PERIOD_NS)
-    assert stamps_ns[0] == 0
-    assert {*np.diff(stamps_ns)} == {16 * PERIOD_NS}
-    np.testing.assert_array_equal(history.T_world_frame, pose_of(999))
+def test_a_long_path_is_drawn_by_so_many_poses(player: LivePlayer, window: FakeWindow) -> None:
+    for index in range(3000):
+        player.newest.history.add(result_of(index))
+    add(player, window, 3000)
+    stamps_ns, poses = shown(player).paths["causal"]
+    assert 500 <= len(stamps_ns) <= 1000
+    assert (stamps_ns[0], stamps_ns[-1]) == (0, 3000 * PERIOD_NS)
+    np.testing.assert_allclose(poses[:, 2], stamps_ns / PERIOD_NS)
 
 
-def test_loops_go_on_being_drawn_where_poses_are_corrected() -> None:
-    history = LiveHistory()
+def test_loops_go_on_being_drawn_where_poses_are_corrected(
+    player: LivePlayer, window: FakeWindow
+) -> None:
     for index in range(8):
-        history.add(result_of(index))
-    loop = Loop(
-        reference_ns=0,
-        stamp_ns=8 * PERIOD_NS,
-        T_reference_frame=np.eye(4),
-        covariance=np.eye(6),
-        n_matches=60,
-        n_inliers=50,
-    )
-    moved = Estimate(stamp_ns=0, T_world_frame=pose_of(-3), covariance=np.eye(6))
-    history.add(replace(result_of(8), loops=(loop,), finished=(moved,)))
-    np.testing.assert_array_equal(history.loop_lines()[:, :, 2], [[-3.0, 8.0]])
+        add(player, window, index)
+    add(player, window, 8, loops=(loop_between(8 * PERIOD_NS, 0),))
+    np.testing.assert_allclose(shown(player).loops[0, :, 2], [8.0, 0.0])
+    add(player, window, 9)
+    np.testing.assert_allclose(shown(player).loops[:, :, 0], 0.5)
 
 
 def test_the_page_shows_the_run_and_pauses(
-    page: Page, player: LivePlayer, window: FakeWindow, view: ViewServer
+    page: Page, player: LivePlayer, window: FakeWindow
 ) -> None:
     add(player, window, 0)
     add(player, window, 7)
@@ -213,24 +191,24 @@ def test_a_run_is_shown_as_a_recording_is(tmp_path: Path) -> None:
     odometry = LiveOdometry(source, max_waiting=100)
     shown = odometry.viewer = LivePlayer(source, odometry.parameters)
     odometry.run(tmp_path, outputs=RunOutputs(report=False))
-    view = shown.frame_view
+    view = shown.newest.view()
     assert view is not None
     with Player(lambda config: source, Config()) as player:
-        player.seek(3)
+        player.set_speed(None)
+        player.play()
         assert player.wait(60.0)
-        expected = player.frame_view
+        expected = player.newest.view()
         assert expected is not None
-        for name in ("raw", "causal", "smoothed", "cloud"):
-            found, wanted = (
-                each.history.accumulated_cloud() if name == "cloud" else each.history.path(name)
-                for each in (shown, player)
-            )
-            for one, other in zip(found, wanted, strict=True):
-                np.testing.assert_array_equal(one, other, err_msg=name)
+        clouds = shown.newest.keyframe_cloud(), player.newest.keyframe_cloud()
+    for name in ("raw", "causal"):
+        for one, other in zip(view.paths[name], expected.paths[name], strict=True):
+            np.testing.assert_array_equal(one, other, err_msg=name)
+    np.testing.assert_array_equal(clouds[0][1], clouds[1][1])
     assert view.index == expected.index == 3
-    assert view.status == Status.OK
     for name in ("image", "T_world_frame"):
         np.testing.assert_array_equal(getattr(view, name), getattr(expected, name))
-    for stamp_ns, T in expected.window_poses.items():
-        np.testing.assert_array_equal(view.window_poses[stamp_ns], T)
-    assert cast(FrameResult, view.result).n_inliers == cast(FrameResult, expected.result).n_inliers
+    assert view.scene is not None
+    assert expected.scene is not None
+    assert view.scene.counts == expected.scene.counts
+    for found, wanted in zip(view.scene.window, expected.scene.window, strict=True):
+        np.testing.assert_array_equal(found.T_world_frame, wanted.T_world_frame)

@@ -1,7 +1,6 @@
 """The page of a recording shows what the player does, and controls it."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -17,11 +16,18 @@ from gvo.io.synthetic import SyntheticRecording
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
 from gvo.viz.view import serve
-from gvo.viz.view.clouds import empty_cloud
 from gvo.viz.view.page import Page, TruthPath
 from gvo.viz.view.player import Player
 from gvo.viz.view.server import ViewServer
-from tests.viz.view.fakes import FakePlayer, cells, frame_view_of, pose_of, stamps_of
+from tests.viz.view.fakes import (
+    PERIOD_NS,
+    FakePlayer,
+    as_player,
+    cells,
+    loop_between,
+    pose_of,
+    stamps_of,
+)
 
 
 @pytest.fixture
@@ -31,15 +37,13 @@ def player() -> FakePlayer:
 
 @pytest.fixture
 def page(view: ViewServer, player: FakePlayer) -> Iterator[Page]:
-    opened = Page(view.viser, cast(Any, player), truth=None)
+    opened = Page(view.viser, as_player(player), truth=None)
     yield opened
     opened.close()
 
 
-def show(
-    page: Page, player: FakePlayer, index: int, *, fault: str = "", is_faulty: bool = False
-) -> None:
-    player.show(frame_view_of(index, is_faulty=is_faulty), fault=fault)
+def show(page: Page, player: FakePlayer, index: int, **changes: Any) -> None:
+    player.show(index, **changes)
     page.settle()
 
 
@@ -55,11 +59,14 @@ def length(view: ViewServer, path: str) -> float:
 
 
 def test_the_numbers_are_those_of_the_frame(page: Page, player: FakePlayer) -> None:
-    show(page, player, 7)
+    for index in range(8):
+        player.show(index)
+    page.settle()
     numbers = cells(page.numbers.content)
     assert numbers["frame"] == "7 of 40"
     assert numbers["stamp"] == "0.700000000"
     assert (numbers["status"], numbers["matches"], numbers["inliers"]) == ("ok", "107", "97")
+    assert numbers["links"] == "1 (1 refused)"
     assert numbers["position"] == "0.000, 0.000, 7.000"
     assert numbers["sigma"].split(", ") == ["0.0283", "0.0566", "0.0849"]
     assert numbers["ms"].startswith("5.5 ")
@@ -72,76 +79,72 @@ def test_a_faulty_frame_tells_its_reason_and_no_counts(page: Page, player: FakeP
     assert "matches" not in numbers
 
 
-def test_paths_grow_and_shrink_by_frame(page: Page, player: FakePlayer, view: ViewServer) -> None:
-    for index in (10, 30, 5):
-        show(page, player, index)
-        assert length(view, "causal") == pytest.approx(index, abs=1e-4)
-        assert length(view, "smoothed") == pytest.approx(index - 1, abs=1e-4)
-
-
-def test_links_are_told_apart(page: Page, player: FakePlayer, view: ViewServer) -> None:
-    show(page, player, 4)
+def test_paths_links_and_loops_are_drawn(page: Page, player: FakePlayer, view: ViewServer) -> None:
+    for index in range(4):
+        player.show(index)
+    show(page, player, 4, loops=(loop_between(4 * PERIOD_NS, 0),))
+    for name in ("raw", "causal"):
+        assert length(view, name) == pytest.approx(4.0, abs=1e-4)
+    (smoothed,) = nodes(view, "/paths/smoothed/")
+    np.testing.assert_allclose(smoothed.points[:, 1, 0], 0.5)  # as the window has it
     (step,) = nodes(view, "/links/step")
     (refused,) = nodes(view, "/links/refused")
-    np.testing.assert_allclose(step.points, [[[0, 0, 3], [0, 0, 4]]])
-    np.testing.assert_allclose(refused.points, [[[0, 0, 0], [0, 0, 4]]])
+    np.testing.assert_allclose(step.points, [[[0.5, 0.0, 3.0], [0.0, 0.0, 4.0]]])
+    np.testing.assert_allclose(refused.points, [[[0.0, 0.0, 0.0], [0.0, 0.0, 4.0]]])
     (loop,) = nodes(view, "/loops/loops")
-    np.testing.assert_allclose(loop.points, [[[0, 0, 0], [0, 0, 4]]])
-
-
-def test_the_camera_stands_at_the_pose(page: Page, player: FakePlayer, view: ViewServer) -> None:
-    show(page, player, 12)
+    np.testing.assert_allclose(loop.points, [[[0.5, 0.0, 4.0], [0.5, 0.0, 0.0]]])
     (camera,) = [node for node in nodes(view, "/camera") if node.name == "/camera"]
-    np.testing.assert_allclose(camera.position, [0.0, 0.0, 12.0])
+    np.testing.assert_allclose(camera.position, [0.0, 0.0, 4.0])
+    assert len(nodes(view, "/ellipsoids/meshes")) == len(nodes(view, "/keyframes/cameras")) == 1
 
 
 def test_a_frame_of_no_points_sends_none(page: Page, player: FakePlayer, view: ViewServer) -> None:
     """Browsers complain of an empty one."""
     for index, n_clouds in ((1, 1), (2, 0), (3, 1)):
-        frame = frame_view_of(index)
-        player.show(frame if n_clouds else replace(frame, cloud=empty_cloud()))
-        page.settle()
+        show(page, player, index, n_points=50 * n_clouds)
         assert len(nodes(view, "/camera/points/")) == n_clouds
 
 
+def test_the_points_of_keyframes_stay(page: Page, player: FakePlayer, view: ViewServer) -> None:
+    show(page, player, 0)
+    show(page, player, 1, n_points=0)
+    (cloud,) = nodes(view, "/cloud/")
+    assert len(cloud.points) == 50
+
+
 def test_a_layer_that_is_hidden_stays_so(page: Page, player: FakePlayer, view: ViewServer) -> None:
-    page.scene.set_visible("raw", False)
+    page.drawing.set_visible("raw", False)
+    player.show(3)
     show(page, player, 4)
     assert [node.visible for node in nodes(view, "/paths/raw")] == [False, True]  # and its line
-    page.scene.set_visible("raw", True)
+    page.drawing.set_visible("raw", True)
     assert [node.visible for node in nodes(view, "/paths/raw")] == [True, True]
 
 
 def test_buttons_take_the_parameters_first(page: Page, player: FakePlayer) -> None:
     page.controls.handle("klt", "n_corners").value = 300
     page.playback.press("step")
-    assert player.calls == [("reconfigure",), ("step",)]
+    page.playback.start.value = 7
+    page.playback.restart()
+    page.playback.toggle()
+    assert player.calls == [("reconfigure",), ("step",), ("restart", 7), ("play",)]
     assert player.config == load_configuration(settings=["klt.n_corners=300"])
-
-
-def test_a_client_seeks_by_the_slider_a_program_does_not(page: Page, player: FakePlayer) -> None:
-    show(page, player, 9)
-    assert page.playback.frame.value == 9
-    assert player.calls == []
-    page.playback.frame.value = 4
-    page.playback.on_seek(cast(Any, SimpleNamespace(client_id=1)))
-    assert player.calls == [("seek", 4)]
 
 
 def test_speeds_have_names(page: Page, player: FakePlayer) -> None:
     for name in ("2 x", "fastest"):
         page.playback.speed.value = name
-        page.playback.on_speed(cast(Any, SimpleNamespace(client_id=1)))
     assert player.calls == [("speed", 2.0), ("speed", None)]
 
 
 def test_a_fault_is_shown(page: Page, player: FakePlayer) -> None:
-    show(page, player, 2, fault="the recording <breaks> off")
+    player.fault = "the recording <breaks> off"
+    show(page, player, 2)
     assert "the recording &lt;breaks&gt; off" in page.message.content
 
 
 def test_the_saved_yaml_is_the_configuration(page: Page, tmp_path: Any) -> None:
-    page.controls.handle("window", "kernel").value = "cauchy"
+    page.controls.handle("ransac", "seed").value = 5
     page.controls.null_handle("window", "size").value = True
     sent: list[tuple[str, bytes]] = []
     client = SimpleNamespace(
@@ -158,11 +161,9 @@ def test_the_saved_yaml_is_the_configuration(page: Page, tmp_path: Any) -> None:
 def test_the_truth_is_laid_onto_the_first_pose(view: ViewServer, player: FakePlayer) -> None:
     T_map_world = se3.exp(np.array([0.3, -0.2, 1.0, 5.0, 6.0, 7.0]))
     T_map_cam = T_map_world @ np.array([pose_of(index) for index in range(40)])
-    page = Page(
-        view.viser,
-        cast(Any, player),
-        truth=Trajectory(stamps_ns=stamps_of(40), T_world_frame=T_map_cam),
-    )
+    truth = Trajectory(stamps_ns=stamps_of(40), T_world_frame=T_map_cam)
+    page = Page(view.viser, as_player(player), truth=truth)
+    player.show(0)
     show(page, player, 20)
     ends = np.concatenate([node.points.reshape(-1, 3) for node in nodes(view, "/paths/truth/")])
     np.testing.assert_allclose(ends[:, :2], 0.0, atol=1e-5)
@@ -170,29 +171,15 @@ def test_the_truth_is_laid_onto_the_first_pose(view: ViewServer, player: FakePla
     page.close()
 
 
-def test_a_closed_page_lets_go_of_the_player(view: ViewServer, player: FakePlayer) -> None:
-    page = Page(view.viser, cast(Any, player), truth=None)
-    assert len(player.callbacks) == 1
-    page.close()
-    assert player.callbacks == []
-
-
 def test_a_page_opens_with_the_first_frame_or_where_its_player_is() -> None:
     recording = SyntheticRecording("handheld", "rgbd", n_frames=3, scale=0.25)
     with Player(lambda config: recording, Config()) as player:
-        for expected in (0, 2):
+        for n_done in (1, 2):
             with serve(player, port=0):
                 assert player.wait(30.0)
-                assert player.index == expected
-            player.seek(2)
+                assert player.newest.n_done == n_done
+            player.step()
             assert player.wait(30.0)
-
-
-def test_the_painter_draws_the_last_frame(page: Page, player: FakePlayer, view: ViewServer) -> None:
-    for index in range(25):
-        player.show(frame_view_of(index))
-    page.settle()
-    assert cells(page.numbers.content)["frame"] == "24 of 40"
 
 
 STEP_NS = 100_000_000

@@ -43,7 +43,7 @@ def server() -> FakeServer:
 
 @pytest.fixture
 def view(server: FakeServer) -> ViewPoint:
-    point = ViewPoint(cast(Any, server), "-y", is_following=True)
+    point = ViewPoint(cast(Any, server))
     point.look_along(pose_of(0), 5.0)
     return point
 

@@ -4,7 +4,6 @@ import socket
 import sys
 import threading
 from http.client import HTTPConnection
-from pathlib import Path
 
 import pytest
 
@@ -12,6 +11,7 @@ from gvo.errors import ConfigurationError
 from gvo.viz.view import serve
 from gvo.viz.view.server import ViewServer, find_port, is_own_page, open_server
 from tests.conftest import listeners
+from tests.viz.view.fakes import FakePlayer, as_player
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
@@ -105,7 +105,7 @@ def test_no_client_gets_a_tunnel_to_a_public_address(view: ViewServer) -> None:
     assert view.viser.request_share_url() is None
 
 
-def test_without_viser_it_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_viser_it_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(ConfigurationError, match=r"pip install \S+\[view\]'"):
-        serve(tmp_path)
+        serve(as_player(FakePlayer()))
