@@ -35,7 +35,7 @@ class DepthRegistration:
     Raises
     ------
     ValueError
-        When `T_color_depth` is no rigid transform.
+        When `T_color_depth` is not a rigid transform.
 
     Notes
     -----

@@ -57,7 +57,7 @@ def frames(
     excerpt : Excerpt, optional
         The part that is wanted; the whole where omitted.
     with_unpaired : bool
-        False leaves out what is no frame of a run, see `is_lost`.
+        False: leave out images that need not pair, see `is_lost`.
     through : callable, optional
         What pairs go through before they are decoded, as the queue of a running camera. Nothing
         is decoded ahead then.

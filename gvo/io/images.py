@@ -76,7 +76,7 @@ class GreyRange:
     white: int = 65535
 
     def __post_init__(self) -> None:
-        """Refuse what is no range."""
+        """Check the range."""
         if not 0 <= self.black < self.white <= 65535:
             raise ValueError(
                 f"expected 0 <= black < white <= 65535, got black={self.black} white={self.white}"

@@ -65,7 +65,7 @@ def open_recording(
     Raises
     ------
     ValueError
-        Where there is no path.
+        If no path is given.
     RecordingError
         When a path is missing or holds no recording, or does not hold what is needed.
     CalibrationError
@@ -90,7 +90,7 @@ def _open(paths: Sequence[Path], config: Config, options: RecordingOptions) -> S
         return BagSource(paths, topics=options, calibration=options.calibration, config=config)
     if len(paths) > 1:
         other = next(one for one in paths if not is_bag(one))
-        raise RecordingError(f"{other}: is no bag; only several bags can be one recording")
+        raise RecordingError(f"{other}: not a bag; only bags can be combined into one recording")
     return _open_folder(paths[0], config, options)
 
 
@@ -106,14 +106,14 @@ def is_bag(path: Path) -> bool:
 def _open_folder(path: Path, config: Config, options: RecordingOptions) -> Source:
     for name in _TOPICS:
         if getattr(options, name) is not None:
-            raise RecordingError(f"{path}: --{name} names a topic of a bag, this is no bag")
+            raise RecordingError(f"{path}: --{name} chooses a topic of a bag, this is not a bag")
     if _is_kitti(path):
         return KittiSource(path, calibration=options.calibration, config=config)
     if (path / "mav0").is_dir() or (path / "cam0").is_dir():
         return EurocSource(path, calibration=options.calibration, config=config)
     if (path / "rgb.txt").is_file():
         return TumSource(path, calibration=options.calibration, config=config)
-    raise RecordingError(f"{path}: is no recording; {_KINDS}")
+    raise RecordingError(f"{path}: not a recording; {_KINDS}")
 
 
 def _is_kitti(path: Path) -> bool:

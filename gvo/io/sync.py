@@ -65,7 +65,7 @@ def pair_images(
         One for each image of stream 0, as soon as it is certain, in the order of the stream
         (ExactTime: of the stamps waiting). Faulty with `is_unpaired` where there is no partner;
         faulty where the stamp repeats or goes behind that of the last pair given: frames have
-        increasing stamps. Images of stream 1 that nobody gets are left out.
+        increasing stamps. Images of stream 1 without partner are left out.
 
     Raises
     ------

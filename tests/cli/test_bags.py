@@ -250,7 +250,7 @@ def test_bag_and_folder_are_no_recording(command: Command, walk_bag: Path, tmp_p
     said = refused(
         command("run", "--no-report", walk_bag, tmp_path / "folder", "--out", tmp_path / "out")
     )
-    assert "only several bags can be one recording" in said
+    assert "only bags can be combined into one recording" in said
 
 
 @pytest.mark.parametrize("suffix", [".bag", ".mcap"])

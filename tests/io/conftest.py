@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from gvo.geometry.camera import Calibration, PinholeCamera
 from gvo.io.recording import RecordingInfo, Sensor, StampedImage
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import FaultyFrame, Frame, StereoFrame
 
 _WIDTH, _HEIGHT = 48, 32
 
@@ -91,6 +90,13 @@ class Tiny:
         }
         return {key: value for key, value in (content | changes).items() if value is not None}
 
+    def ros_pair(self, baseline: float = 1.0) -> dict[str, object]:
+        P = [50.0, 0, 23.5, -50.0 * baseline, 0, 50.0, 15.5, 0, 0, 0, 1, 0]
+        return {
+            "left": self.ros_camera(),
+            "right": self.ros_camera(projection_matrix={"data": P}),
+        }
+
     def write_image(self, path: Path, pixels: NDArray[Any]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         assert cv2.imwrite(str(path), pixels)
@@ -154,14 +160,6 @@ class Tiny:
             (folder / f"{stream}.txt").write_text("\n".join(rows) + "\n")
         (folder / "calibration.yaml").write_text(yaml.safe_dump(self.ros_camera()))
         return folder
-
-    def fingerprint(self, frame: Frame | FaultyFrame) -> tuple[object, ...]:
-        """Return all that a frame holds, comparable bit by bit."""
-        if isinstance(frame, FaultyFrame):
-            return ("faulty", frame.stamp_ns, frame.reason)
-        if isinstance(frame, StereoFrame):
-            return ("stereo", frame.stamp_ns, frame.left.tobytes(), frame.right.tobytes())
-        return ("rgbd", frame.stamp_ns, frame.image.tobytes(), frame.depth.tobytes())
 
 
 def _give(pixels: NDArray[Any] | Exception) -> NDArray[Any]:

@@ -18,11 +18,11 @@ def test_a_missing_path_is_refused_with_what_a_recording_may_be(tmp_path: Path) 
 
 
 def test_other_files_and_folders_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"is no recording; .*KITTI.*EuRoC.*TUM"):
+    with pytest.raises(RecordingError, match=r"not a recording; .*KITTI.*EuRoC.*TUM"):
         open_recording(tmp_path)
     path = tmp_path / "drive.mp4"
     path.write_bytes(b"video")
-    with pytest.raises(RecordingError, match="is no recording"):
+    with pytest.raises(RecordingError, match="not a recording"):
         open_recording(path)
 
 
@@ -67,5 +67,5 @@ def test_options_and_configuration_reach_the_source(tmp_path: Path, tiny: Any) -
 def test_topics_of_a_folder_are_refused(tmp_path: Path, tiny: Any, name: str) -> None:
     folder = tiny.write_kitti(tmp_path / "a")
     topics: dict[str, Any] = {name: "/topic"}
-    with pytest.raises(RecordingError, match=f"--{name} names a topic of a bag"):
+    with pytest.raises(RecordingError, match=f"--{name} chooses a topic of a bag"):
         open_recording(folder, options=RecordingOptions(**topics))

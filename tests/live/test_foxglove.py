@@ -276,7 +276,7 @@ def test_services_are_called(server: Foxglove) -> None:
         answer = client.call("/gvo/set_pose", request)
         assert asked[-1] == 3.5
         assert isinstance(answer, bytes)
-        assert "a message of 5 bytes is no" in str(client.call("/gvo/set_pose", b"\0\1\0\0"))
+        assert "a message of 5 bytes is not a" in str(client.call("/gvo/set_pose", b"\0\1\0\0"))
         assert "ncoding" in str(client.call("/gvo/set_pose", request, encoding=b"json"))
 
 

@@ -181,7 +181,7 @@ def _is_one_lens(color: Calibration, depth: Calibration) -> bool:
 
 def _advice(difference: str, frames: tuple[str, str], why: Failure) -> str:
     if difference:
-        return f"depth: it is not registered to colour ({difference}; {why.reason}): {_REMEDY}"
+        return f"depth: not registered to colour ({difference}; {why.reason}): {_REMEDY}"
     if all(frames):
         return (
             f"depth: taken as registered to colour, though its frame is {frames[1]} and that of "
@@ -193,7 +193,7 @@ def _advice(difference: str, frames: tuple[str, str], why: Failure) -> str:
 def _find_extrinsics(
     reader: MessageReader, target: BagCamera, source: BagCamera
 ) -> tuple[FloatArray, str] | Failure:
-    """Find T_target_source of two cameras, metres, and what told it.
+    """Find T_target_source of two cameras, metres, and where it was found.
 
     By the tf between the frames that their `CameraInfo` name; where these are empty, by the `tf`
     topics beside the streams of librealsense, which map their reference to each stream.
@@ -252,6 +252,6 @@ def _transform(message: BagMessage) -> FloatArray:
     T = transform_of(content.translation, content.rotation)
     if isinstance(T, Failure):
         raise RecordingError(
-            f"{message.topic.name}: holds no transform: {T.reason}; give --calibration FILE"
+            f"{message.topic.name}: not a transform: {T.reason}; give --calibration FILE"
         )
     return T

@@ -113,11 +113,11 @@ def _numbers_of(message: BagMessage) -> _Numbers | None:
 
 
 def find_contradiction(reader: BagReader, *, by_camera_info: bool) -> str:
-    """Say why files that nothing vouches for are not one recording; empty where they may be.
+    """Say why files without metadata are not parts of one recording; empty if they may be.
 
     Of those with images of the same topics one must follow the other, with the same `CameraInfo`.
     Files that were found in a folder, not given together, must also hold the same image topics
-    and follow without a gap. A bag that a run wrote is none of a recording.
+    and follow without a gap. A bag that a run wrote is not a part of a recording.
     """
     parts = [(file, _image_names(file)) for file in reader.loose_files]
     for file, _ in parts:

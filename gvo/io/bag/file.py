@@ -164,7 +164,7 @@ class BagFile:
             messages = reader.messages(connections=connections) if connections else ()
             for connection, log_time_ns, data in messages:
                 if not isinstance(log_time_ns, int) or not isinstance(data, bytes):
-                    raise TypeError("a row of the database holds no message")
+                    raise TypeError("a row of the database is not a message")
                 content = data if is_ros1 else inflate_message(data)
                 yield FoundMessage(channels[connection.id], log_time_ns, content)
 

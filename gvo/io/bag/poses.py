@@ -124,7 +124,7 @@ def _sample(message: Any, topic: Topic) -> PoseSample:  # noqa: ANN401 - made at
     position, orientation = _parts(message, topic.type)
     T = transform_of(position, orientation)
     if isinstance(T, Failure):
-        raise RecordingError(f"{topic.name} at {stamp_ns} ns: the pose is no transform: {T.reason}")
+        raise RecordingError(f"{topic.name} at {stamp_ns} ns: not a pose: {T.reason}")
     return PoseSample(
         stamp_ns=stamp_ns,
         T_world_frame=T,
@@ -174,8 +174,8 @@ class Positions:
 def read_positions(reader: MessageReader, topic: Topic, faults: InputFaults) -> Positions:
     """Read the positions of a topic; skip and count what holds none.
 
-    Those of `NavSatFix` are east, north and up of the first fix. A status below zero, or a
-    number that is no place on Earth, is no fix.
+    Those of `NavSatFix` are east, north and up of the first fix. Messages with a status
+    below zero or an impossible place are skipped.
     """
     rows: dict[int, FloatArray] = {}
     frame: str | None = None
@@ -211,7 +211,7 @@ def _numbers(message: Any, topic: Topic) -> FloatArray:  # noqa: ANN401 - made a
     if topic.type != FIX_TYPE:
         point = np.array([getattr(message.point, axis) for axis in "xyz"], dtype=np.float64)
         if not np.all(np.isfinite(point)):
-            raise RecordingError(f"{topic.name} at {stamp_of(message.header)} ns: no point")
+            raise RecordingError(f"{topic.name} at {stamp_of(message.header)} ns: not a point")
         return point
     fix = np.array([message.latitude, message.longitude, message.altitude], dtype=np.float64)
     is_place = np.all(np.isfinite(fix)) and abs(fix[0]) <= 90.0 and abs(fix[1]) <= 360.0

@@ -66,7 +66,7 @@ class BagMessage:
             return decode(memoryview(self.data), self.topic.type)
         except FAULTS as error:
             raise RecordingError(
-                f"{self.topic.name}: a message of {len(self.data)} bytes is no {self.topic.type}"
+                f"{self.topic.name}: a message of {len(self.data)} bytes is not a {self.topic.type}"
             ) from error
 
 

@@ -59,7 +59,7 @@ class BagSource:
     Raises
     ------
     ValueError
-        Where there is no path.
+        If no path is given.
     RecordingError, CalibrationError
         When the bag cannot be read, or holds no camera or no calibration.
     """

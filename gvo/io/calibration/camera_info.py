@@ -188,7 +188,7 @@ def _matrices(fields: CameraFields) -> tuple[FloatArray, FloatArray, FloatArray]
 
 def _check_matrices(K: FloatArray, R: FloatArray, P: FloatArray, where: str) -> None:
     if not se3.is_rotation(R, tolerance=ROTATION_TOLERANCE):
-        raise CalibrationError(f"{where}: R is no rotation")
+        raise CalibrationError(f"{where}: R is not a rotation")
     for name, matrix in (("K", K), ("P", P)):
         if not np.allclose(matrix[2, :3], [0.0, 0.0, 1.0], atol=1e-6):
             raise CalibrationError(
@@ -258,7 +258,7 @@ def has_baseline(left: Calibration, right: Calibration) -> bool:
 
 
 def stereo_baseline(calibrations: tuple[Calibration, Calibration], where: str) -> float:
-    """Return the baseline of a rectified pair in metres; refuse what is no rectified pair."""
+    """Return the baseline of a rectified pair in metres; refuse other pairs."""
     left, right = calibrations
     if (left.width, left.height) == (right.width, right.height) and not has_baseline(left, right):
         raise CalibrationError(

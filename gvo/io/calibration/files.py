@@ -63,7 +63,7 @@ class CameraSet:
     origin : str
         The names of the files.
     baseline_from : str
-        Which key of them told the baseline; empty for one camera.
+        The key that holds the baseline; empty for one camera.
     T_body_cam : ndarray of float64, shape (4, 4), optional
         Maps the rectified left or colour camera to the body of the files, metres.
     depth_scale : float, optional
@@ -391,14 +391,14 @@ def read_yaml(path: Path) -> dict[Any, Any]:
         with named_faults(CalibrationError, path, "the calibration cannot be read"):
             text = read_text(path, max_bytes=MAX_CHARACTERS)
     except UnicodeDecodeError as error:
-        raise CalibrationError(f"{path}: the calibration is no text") from error
+        raise CalibrationError(f"{path}: the calibration is not text") from error
     if text.startswith(_OPENCV_HEADER):
         text = text.partition("\n")[2]  # with its colon it is no directive of YAML
     try:
         # Of several documents, as `ros2 topic echo` prints them, the first counts.
         content = load_yaml(text, _Loader)
     except YamlError as error:
-        raise CalibrationError(f"{path}: the calibration is no YAML ({error})") from error
+        raise CalibrationError(f"{path}: the calibration is not YAML ({error})") from error
     if not isinstance(content, dict):
         raise CalibrationError(f"{path}: the calibration holds no keys")
     return content

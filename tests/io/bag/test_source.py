@@ -296,8 +296,7 @@ def test_recorded_images_are_decoded(
     gvo_data: Path, tmp_path: Path, tiny: Any, name: str, topic: str, shape: tuple[int, ...]
 ) -> None:
     path = tmp_path / "pair.yaml"
-    right = tiny.ros_camera(projection_matrix={"data": _P_RIGHT})
-    path.write_text(yaml.safe_dump({"left": tiny.ros_camera(), "right": right}))
+    path.write_text(yaml.safe_dump(tiny.ros_pair()))
     topics = TopicChoice(left=topic, right=topic)
     source = BagSource(gvo_data / "bags" / name, topics=topics, calibration=path)
     pixels = next(source.images()).load()

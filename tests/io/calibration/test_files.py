@@ -300,13 +300,7 @@ def test_a_file_may_carry_the_scale_of_depth(tmp_path: Path, tiny: Any) -> None:
 
 
 def test_a_stereo_pair_is_two_cameras(tmp_path: Path, tiny: Any) -> None:
-    pair = {
-        "left": tiny.ros_camera(),
-        "right": tiny.ros_camera(
-            projection_matrix={"data": [50.0, 0, 23.5, -20.0, 0, 50, 15.5, 0, 0, 0, 1, 0]}
-        ),
-    }
-    path = _write(tmp_path / "pair.yaml", pair)
+    path = _write(tmp_path / "pair.yaml", tiny.ros_pair(0.4))
     found = _stereo(path, is_rectified=True)
     assert (found.pair[0].P[0, 3], found.pair[1].P[0, 3]) == (0.0, -20.0)
     assert found.baseline_from == "P"

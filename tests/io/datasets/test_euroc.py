@@ -132,9 +132,7 @@ def test_the_pose_on_the_body_is_that_of_the_rectified_camera(tmp_path: Path, ti
     folder = _write(tmp_path / "m", tiny)
     T_body_left, _ = _poses()
     sensors = [folder / "mav0" / f"cam{n}" / "sensor.yaml" for n in range(2)]
-    P = [50.0, 0, 23.5, -50.0, 0, 50.0, 15.5, 0, 0, 0, 1, 0]
-    pair = {"left": tiny.ros_camera(), "right": tiny.ros_camera(projection_matrix={"data": P})}
-    (tmp_path / "pair.yaml").write_text(yaml.safe_dump(pair))
+    (tmp_path / "pair.yaml").write_text(yaml.safe_dump(tiny.ros_pair()))
     for calibration in (None, sensors, folder, folder / "mav0", tmp_path / "pair.yaml"):
         info = EurocSource(folder, calibration=calibration).info
         assert info.T_body_cam is not None

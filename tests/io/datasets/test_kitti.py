@@ -75,33 +75,17 @@ def test_poses_of_another_length_are_refused(tmp_path: Path, tiny: Any) -> None:
         KittiSource(folder).ground_truth()
 
 
-def test_a_calibration_file_wins(tmp_path: Path, tiny: Any) -> None:
+def test_calibration_files_win(tmp_path: Path, tiny: Any) -> None:
     folder = tiny.write_kitti(tmp_path / "00")
-    P = [50.0, 0, 23.5, -50.0, 0, 50.0, 15.5, 0, 0, 0, 1, 0]
-    pair = {"left": tiny.ros_camera(), "right": tiny.ros_camera(projection_matrix={"data": P})}
-    path = tmp_path / "pair.yaml"
-    path.write_text(yaml.safe_dump(pair))
-    info = KittiSource(folder, calibration=path).info
-    assert getattr(info.camera, "baseline", None) == 1.0
-    assert any("pair.yaml" in decision for decision in info.decisions)
-
-
-def test_two_files_may_replace_the_calibration(tmp_path: Path, tiny: Any) -> None:
-    folder = tiny.write_kitti(tmp_path / "00")
+    assert "calibration: calib.txt, rectified" in KittiSource(folder, calibration=()).info.decisions
     (folder / "calib.txt").unlink()
-    P = [50.0, 0, 23.5, -50.0, 0, 50.0, 15.5, 0, 0, 0, 1, 0]
-    (tmp_path / "l.yaml").write_text(yaml.safe_dump(tiny.ros_camera()))
-    right = tiny.ros_camera(projection_matrix={"data": P})
-    (tmp_path / "r.yaml").write_text(yaml.safe_dump(right))
-    info = KittiSource(folder, calibration=[tmp_path / "l.yaml", tmp_path / "r.yaml"]).info
-    assert getattr(info.camera, "baseline", None) == 1.0
-    assert "calibration: l.yaml + r.yaml, rectified" in info.decisions
-    assert info.T_body_cam is None
-
-
-def test_an_empty_list_of_files_is_none(tmp_path: Path, tiny: Any) -> None:
-    info = KittiSource(tiny.write_kitti(tmp_path / "00"), calibration=()).info
-    assert "calibration: calib.txt, rectified" in info.decisions
+    pair = tiny.ros_pair()
+    for name, content in {"pair": pair, "l": pair["left"], "r": pair["right"]}.items():
+        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(content))
+    for names in (["pair.yaml"], ["l.yaml", "r.yaml"]):
+        info = KittiSource(folder, calibration=[tmp_path / name for name in names]).info
+        assert getattr(info.camera, "baseline", None) == 1.0
+        assert f"calibration: {' + '.join(names)}, rectified" in info.decisions
 
 
 def _without(name: str) -> Any:

@@ -149,7 +149,7 @@ def _parse(kind: Any, stream: ReadDataStream, *size: int) -> Any:  # noqa: ANN40
     try:
         return kind.read(stream, *size)
     except (McapError, struct.error, ValueError, OverflowError) as error:
-        raise DamageError(f"a record that is no {kind.__name__}") from error
+        raise DamageError(f"a malformed {kind.__name__}") from error
 
 
 def _places_of_summary(whole: Window) -> list[int]:
