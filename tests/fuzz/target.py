@@ -13,12 +13,6 @@ from gvo.errors import GvoError
 MAX_BYTES = 4096
 """Of an input, where the target does not say otherwise."""
 
-MAX_SECONDS = 25
-"""Of one execution; longer is a hang."""
-
-MAX_MEGABYTES = 2048
-"""Of resident memory."""
-
 T = TypeVar("T")
 
 Mutate = Callable[[bytes, random.Random], bytes]
@@ -39,7 +33,6 @@ class Target:
     documented: tuple[type[Exception], ...] = ()
     mutate: Mutate | None = None
     max_bytes: int = MAX_BYTES
-    dictionary: Sequence[bytes] = ()
 
     def execute(self, data: bytes) -> None:
         with warnings.catch_warnings():

@@ -1,62 +1,213 @@
-"""Plant mutants one at a time, and see whether a test fails: the work of `assurance.py --mutation`.
+"""Plant small faults in the code, one at a time, and count those that make a test fail.
 
-The tests are collected once, by a process that has imported everything; each mutant is a fork of
-it, in which the code of one function is replaced. It runs the tests that reach the changed lines,
-quick ones first, until one fails. Hypothesis draws the same examples each time and does not
-shrink. Each test may use ten times the processor time that it takes without a mutant, and some
-seconds; beyond, the mutant counts as killed by time. What no test reaches survives.
+Each mutant replaces one node of the syntax tree inside of a function:
+a comparison by its neighbour or its opposite; + by -, * by /, `and` by `or`, likewise others; the
+operands of @ swapped; not and minus dropped, a condition negated; a number by one more; minimum by
+maximum and the like; a call, an assignment to an element or a raise left out; break by continue;
+None returned; a keyword argument left out.
 
-Results are kept in a file, by the text of the function and of the change: a run that is stopped
-goes on where it was. What depends on other functions is not noticed: begin a new file
-when the code has changed much. With other tests, `again` runs what survived once more.
+Messages, docstrings, annotations and decorators stay. The tests are collected once and run once to
+find which lines each of them reaches. Each mutant is then a fork in which the code of one function
+is replaced; it runs the tests that reach the changed lines, quick ones first, until one fails or
+takes ten times its processor time. What no test reaches survives. The survivors are printed, then
+the share that was killed, with the 95 % interval for all mutants (Wilson's).
+
+Example: python tests/quality/mutation.py --sample 200 --seed 0 --jobs 2
 """
 
+import argparse
 import ast
 import gc
 import json
+import math
 import os
 import random
-import resource
 import signal
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator
+from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from itertools import zip_longest
 from pathlib import Path
 from types import CodeType, FunctionType
+from typing import Any
 
 import coverage
 import pytest
-from mutants import Mutant, mutants_of  # type: ignore[import-not-found]
 
-KILLED, TIMEOUT, SURVIVED, UNUSABLE = "killed", "timeout", "survived", "unusable"
-_MEMORY = 8 << 30
-_PATIENCE = 10.0
+ROOT = Path(__file__).resolve().parents[2]
+PATHS = ("gvo/geometry", "gvo/backend", "gvo/kernels", "gvo/trajectory", "gvo/io/sync.py")
+TESTS = ("tests/geometry", "tests/backend", "tests/kernels", "tests/trajectory", "tests/io")
+MIN_KILLED = 0.9
+UNUSABLE = 3
+SPARE_S = 5.0
+PATIENCE = 10.0
+
+_NEIGHBOURS: dict[type[ast.AST], tuple[type[Any], ...]] = {
+    ast.Lt: (ast.LtE, ast.GtE), ast.LtE: (ast.Lt, ast.Gt), ast.Gt: (ast.GtE, ast.LtE),
+    ast.GtE: (ast.Gt, ast.Lt), ast.Eq: (ast.NotEq,), ast.NotEq: (ast.Eq,), ast.Is: (ast.IsNot,),
+    ast.IsNot: (ast.Is,), ast.In: (ast.NotIn,), ast.NotIn: (ast.In,), ast.Add: (ast.Sub,),
+    ast.Sub: (ast.Add,), ast.Mult: (ast.Div,), ast.Div: (ast.Mult,), ast.FloorDiv: (ast.Mult,),
+    ast.Mod: (ast.Mult,), ast.Pow: (ast.Mult,), ast.BitAnd: (ast.BitOr,), ast.BitOr: (ast.BitAnd,),
+    ast.And: (ast.Or,), ast.Or: (ast.And,),
+}  # fmt: skip
+_SWAPS = ("minimum maximum", "min max", "any all", "argmin argmax", "zeros ones", "sin cos")
+_NAMES = {a: b for pair in _SWAPS for a, b in (pair.split(), pair.split()[::-1])}
+_FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
+_UNTOUCHED = {"annotation", "returns", "decorator_list"}
+_CONDITIONS = (ast.Name, ast.Attribute, ast.Call, ast.NamedExpr, ast.Subscript)
+_HARMLESS = {"reason", "encoding", "newline", "strict"}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Baseline:
-    """What the tests do without a mutant."""
+class Mutant:
+    """One fault: `node` in place of what stands in a field of `parent`."""
 
-    seconds: list[float]
-    reached: dict[str, dict[int, list[int]]]  # by file and line: the tests that run it
+    path: Path
+    function: str
+    lines: range
+    operator: str
+    old: ast.AST
+    node: ast.AST
+    tree: ast.Module
+    parent: ast.AST
+    place: tuple[str, int | None]
+
+    def __str__(self) -> str:
+        change = f"{ast.unparse(self.old)!r} -> {ast.unparse(self.node)!r}"
+        return f"{self.path}:{self.lines.start} {self.function}: {self.operator} {change}"
+
+    def plant(self) -> None:
+        """Change the tree; only once, in a process that ends with the mutant."""
+        ast.copy_location(self.node, self.old)
+        name, index = self.place
+        if index is None:
+            setattr(self.parent, name, self.node)
+        else:
+            getattr(self.parent, name)[index] = self.node
+        ast.fix_missing_locations(self.tree)
+
+
+def mutants_of(path: Path) -> Iterator[Mutant]:
+    """Yield all mutants of a file."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for names, function in _functions(tree, ()):
+        for parent, place, statement in _places(function, function):
+            value = getattr(parent, place[0])
+            old = value if place[1] is None else value[place[1]]
+            for operator, node in _faults(old, place[0]):
+                where: Any = {"path": path, "function": ".".join(names), "lines": _lines(statement)}
+                change: Any = {"old": old, "node": node, "parent": parent, "place": place}
+                yield Mutant(operator=operator, tree=tree, **where, **change)
+
+
+def _functions(node: ast.AST, names: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield the outermost functions and methods with their qualified names."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, _FUNCTIONS):
+            yield (*names, child.name), child
+        elif isinstance(child, ast.ClassDef):
+            yield from _functions(child, (*names, child.name))
+
+
+def _places(
+    parent: ast.AST, statement: ast.stmt
+) -> Iterator[tuple[ast.AST, tuple[str, int | None], ast.stmt]]:
+    """Yield where each node stands that may be changed, and the statement that it is part of."""
+    for name, value in ast.iter_fields(parent):
+        for index, node in enumerate(value if isinstance(value, list) else [value]):
+            if name in _UNTOUCHED or not isinstance(node, ast.AST) or _is_text(node):
+                continue
+            inside = node if isinstance(node, ast.stmt) else statement
+            yield parent, (name, index if isinstance(value, list) else None), inside
+            if not isinstance(node, ast.Raise):
+                yield from _places(node, inside)
+
+
+def _is_text(node: ast.AST) -> bool:
+    """Tell whether a node only says something, or is the head of a function."""
+    if isinstance(node, ast.arguments):
+        return True
+    if isinstance(node, ast.keyword):
+        return node.arg == "reason"
+    if isinstance(node, ast.Expr):
+        node = node.value
+    is_failure = isinstance(node, ast.Call) and ast.unparse(node.func) == "Failure"
+    is_string = isinstance(node, ast.Constant) and isinstance(node.value, str)
+    return is_failure or is_string or isinstance(node, ast.JoinedStr)
+
+
+def _lines(statement: ast.stmt) -> range:
+    """Return the lines of a statement; of a compound one those of its head."""
+    body = getattr(statement, "body", None)
+    last = body[0].lineno - 1 if body else statement.end_lineno
+    return range(statement.lineno, max(last or 0, statement.lineno) + 1)
+
+
+def _faults(node: Any, name: str) -> Iterator[tuple[str, ast.AST]]:
+    """Yield what may stand in the place of a node."""
+    if name in ("test", "ifs") and isinstance(node, _CONDITIONS):
+        yield "logic", ast.UnaryOp(op=ast.Not(), operand=node)
+    if isinstance(node, ast.stmt):
+        yield from _statements(node)
+    if isinstance(node, ast.Compare):
+        for other in _NEIGHBOURS[type(node.ops[0])] if len(node.ops) == 1 else ():
+            yield "comparison", _changed(node, ops=[other()])
+    elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult):
+        yield "arithmetic", _changed(node, left=node.right, right=node.left)
+    elif isinstance(node, ast.BinOp | ast.BoolOp | ast.AugAssign):
+        for other in _NEIGHBOURS.get(type(node.op), ()):
+            yield "arithmetic", _changed(node, op=other())
+    else:
+        yield from _atoms(node)
+
+
+def _changed(node: Any, **parts: object) -> ast.AST:
+    changed: ast.AST = type(node)(**dict(ast.iter_fields(node)) | parts)
+    return changed
+
+
+def _atoms(node: Any) -> Iterator[tuple[str, ast.AST]]:
+    if isinstance(node, ast.UnaryOp):
+        yield "logic", node.operand
+    elif isinstance(node, ast.Constant) and isinstance(node.value, int | float):
+        value = node.value
+        is_large = isinstance(value, float) and abs(value) > 1e3
+        new = not value if isinstance(value, bool) else value * 2 if is_large else value + 1
+        yield "number", ast.Constant(value=new)
+    elif isinstance(node, ast.Attribute) and node.attr in _NAMES:
+        yield "name", _changed(node, attr=_NAMES[node.attr])
+    elif isinstance(node, ast.Name) and node.id in _NAMES:
+        yield "name", _changed(node, id=_NAMES[node.id])
+    elif isinstance(node, ast.Call) and not ast.unparse(node.func).rpartition(".")[2][:1].isupper():
+        for each in node.keywords:
+            rest = [other for other in node.keywords if other is not each]
+            if each.arg and each.arg not in _HARMLESS:
+                yield "argument", _changed(node, keywords=rest)
+
+
+def _statements(node: ast.stmt) -> Iterator[tuple[str, ast.AST]]:
+    is_left_out = isinstance(node, ast.Raise | ast.AugAssign | ast.Expr)
+    if isinstance(node, ast.Assign):
+        is_left_out = isinstance(node.targets[0], ast.Attribute | ast.Subscript)
+    if is_left_out:
+        yield "statement", ast.Pass()
+    elif isinstance(node, ast.Break | ast.Continue):
+        yield "statement", ast.Continue() if isinstance(node, ast.Break) else ast.Break()
+    elif isinstance(node, ast.Return) and not isinstance(node.value, ast.Constant | None):
+        yield "statement", ast.Return(value=ast.Constant(value=None))
 
 
 @dataclass(kw_only=True)
 class Mutation:
     """A pytest plugin that runs mutants in place of the tests."""
 
-    paths: list[Path]
-    results_file: Path
-    sample: int | None
-    seed: int
+    mutants: list[Mutant]
     jobs: int
-    spare_s: float
-    again: bool = False
-    mutants: list[Mutant] = field(default_factory=list)
-    results: dict[str, str] = field(default_factory=dict)
+    survivors: list[Mutant] = field(default_factory=list)
+    n_run: int = 0
     failed: bool = False
 
     def pytest_collection(self) -> None:
@@ -64,247 +215,120 @@ class Mutation:
         from hypothesis import Phase, settings  # not before pytest has rewritten it
 
         phases = (Phase.explicit, Phase.generate)
-        settings.register_profile(
-            "mutation", deadline=None, derandomize=True, database=None, phases=phases
-        )
+        options: Any = {"deadline": None, "derandomize": True, "database": None, "phases": phases}
+        settings.register_profile("mutation", **options)
         settings.load_profile("mutation")
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Remember that a test failed."""
         self.failed |= report.failed
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
-        """Run the mutants."""
-        every = [mutant for path in self.paths for mutant in mutants_of(path)]
-        # In the order of chance: what is done when a run is stopped is a sample too.
-        random.Random(self.seed).shuffle(every)
-        self.mutants = [each for each in every if each.before != each.after][: self.sample]
-        if self.results_file.exists():
-            self.results = json.loads(self.results_file.read_text(encoding="utf-8"))
-        undone = ["", UNUSABLE, *([SURVIVED] if self.again else [])]
-        left = [each for each in self.mutants if self.results.get(each.key, "") in undone]
-        _say(f"{len(every)} mutants, {len(self.mutants)} chosen, {len(left)} to run")
-        if left:
-            baseline = self._measure(session)
-            self._run_all(left, session, baseline)
-        return True
-
-    def _measure(self, session: pytest.Session) -> Baseline:
-        """Run all tests once, in a fork, and find which lines each of them reaches."""
         with tempfile.TemporaryDirectory() as folder:
-            answer = Path(folder) / "baseline.json"
+            answer = Path(folder) / "reached.json"
             pid = os.fork()
             if pid == 0:
                 _hush()
-                os._exit(self._measure_here(session, answer))
-            if os.waitpid(pid, 0)[1] != 0:
-                raise pytest.UsageError("the tests fail without a mutant: " + _text(answer))
-            found = json.loads(_text(answer))
-        reached = {
-            path: {int(line): tests for line, tests in lines.items()}
-            for path, lines in found["reached"].items()
-        }
-        _say(f"{len(session.items)} tests, {sum(found['seconds']):.0f} s without a mutant")
-        return Baseline(seconds=found["seconds"], reached=reached)
+                self._measure(session, answer)
+                os._exit(int(self.failed))
+            if os.waitpid(pid, 0)[1]:
+                raise pytest.UsageError("the tests fail without a mutant")
+            seconds, reached = json.loads(answer.read_text(encoding="utf-8"))
+        gc.freeze()  # so that forks share what is there
+        running: dict[int, Mutant] = {}
+        for mutant in self.mutants:
+            lines = reached.get(str(mutant.path), {})
+            tests = {test for line in mutant.lines for test in lines.get(str(line), [])}
+            chosen = sorted(tests, key=lambda test: seconds[test])
+            running[self._fork(mutant, session, chosen, seconds)] = mutant
+            while len(running) >= self.jobs:
+                self._await(running)
+        while running:
+            self._await(running)
+        return True
 
-    def _measure_here(self, session: pytest.Session, answer: Path) -> int:
-        files = [str(path.resolve()) for path in self.paths]
+    def _measure(self, session: pytest.Session, answer: Path) -> None:
+        """Run all tests once; write down how long each takes and which lines it reaches."""
+        files = sorted({str(mutant.path) for mutant in self.mutants})
         tracer = coverage.Coverage(data_file=None, config_file=False, include=files)
         tracer.start()
         seconds = []
-        for index in range(len(session.items)):
+        indices = range(len(session.items))
+        for index, following in zip_longest(indices, indices[1:]):
             tracer.switch_context(str(index))
             start = time.process_time()
-            self._run_test(session, index, None)
+            _run_test(session, index, following)
             seconds.append(time.process_time() - start)
-            if self.failed:
-                answer.write_text(session.items[index].nodeid, encoding="utf-8")
-                return 1
         tracer.stop()
         data = tracer.get_data()
         reached = {
-            path: {
+            file: {
                 line: [int(name) for name in names if name]
-                for line, names in data.contexts_by_lineno(path).items()
+                for line, names in data.contexts_by_lineno(file).items()
             }
-            for path in data.measured_files()
+            for file in data.measured_files()
         }
-        answer.write_text(json.dumps({"seconds": seconds, "reached": reached}), encoding="utf-8")
-        return 0
-
-    def _run_test(self, session: pytest.Session, index: int, following: int | None) -> None:
-        item = session.items[index]
-        next_item = None if following is None else session.items[following]
-        item.ihook.pytest_runtest_protocol(item=item, nextitem=next_item)
-
-    def _run_all(self, left: Sequence[Mutant], session: pytest.Session, baseline: Baseline) -> None:
-        """Keep as many forks busy as there are jobs, and write down what they find."""
-        functions = live_functions(self.paths)
-        gc.freeze()  # so that forks share what is there
-        waiting, done = list(reversed(left)), 0
-        running: dict[int, tuple[Mutant, float]] = {}
-        try:
-            while waiting or running:
-                while waiting and len(running) < self.jobs:
-                    mutant = waiting.pop()
-                    tests = select_tests(mutant, baseline)
-                    pid = self._fork(mutant, functions, session, tests, baseline.seconds)
-                    limit = 60.0 + 20.0 * sum(baseline.seconds[index] for index in tests)
-                    running[pid] = mutant, time.monotonic() + limit
-                for pid, result in _ended({pid: end for pid, (_, end) in running.items()}):
-                    self.results[running.pop(pid)[0].key] = result
-                    done += 1
-                    if done % 25 == 0:
-                        self._save()
-                        _say(f"{done} of {len(left)}")
-        finally:
-            for pid in running:
-                os.killpg(pid, signal.SIGKILL)
-            self._save()
+        answer.write_text(json.dumps([seconds, reached]), encoding="utf-8")
 
     def _fork(
-        self,
-        mutant: Mutant,
-        functions: dict[tuple[str, str], list[FunctionType]],
-        session: pytest.Session,
-        tests: list[int],
-        seconds: list[float],
+        self, mutant: Mutant, session: pytest.Session, tests: list[int], seconds: list[float]
     ) -> int:
-        """Start the tests of a mutant, and return the process that runs them."""
+        """Start the tests of a mutant; the process ends with 0 where none fails."""
         pid = os.fork()
         if pid:
             return pid
-        code = 3
         try:
-            os.setsid()
             _hush()
-            resource.setrlimit(resource.RLIMIT_DATA, (_MEMORY, _MEMORY))
-            if install(mutant, functions):
-                code = int(self._is_noticed(session, tests, seconds))
-        finally:
-            os._exit(code)
+            signal.signal(signal.SIGPROF, signal.SIG_DFL)
+            if not install(mutant):
+                os._exit(UNUSABLE)
+            for test, following in zip_longest(tests, tests[1:]):
+                signal.setitimer(signal.ITIMER_PROF, SPARE_S + PATIENCE * seconds[test])
+                _run_test(session, test, following)
+                if self.failed:
+                    break
+        except BaseException:  # noqa: BLE001 - as pytest.exit or an interrupt: noticed
+            self.failed = True
+        os._exit(int(self.failed))
 
-    def _is_noticed(self, session: pytest.Session, tests: list[int], seconds: list[float]) -> bool:
-        signal.signal(signal.SIGPROF, signal.SIG_DFL)
-        for index, following in zip_longest(tests, tests[1:]):
-            limit = self.spare_s + _PATIENCE * seconds[index]
-            signal.setitimer(signal.ITIMER_PROF, limit)
-            try:
-                self._run_test(session, index, following)
-            except BaseException:  # noqa: BLE001 - as pytest.exit or an interrupt: noticed
-                return True
-            if self.failed:
-                return True
-        return False
-
-    def _save(self) -> None:
-        new = self.results_file.with_suffix(".new")
-        new.write_text(json.dumps(self.results, indent=0, sort_keys=True), encoding="utf-8")
-        new.replace(self.results_file)
+    def _await(self, running: dict[int, Mutant]) -> None:
+        pid, status = os.wait()
+        mutant = running.pop(pid)
+        self.n_run += os.waitstatus_to_exitcode(status) != UNUSABLE
+        if status == 0:
+            self.survivors.append(mutant)
+            print(mutant, file=sys.__stdout__, flush=True)
 
 
-def live_functions(paths: Iterable[Path]) -> dict[tuple[str, str], list[FunctionType]]:
-    """Return the functions that were made of files, by file and qualified name."""
-    files = {str(path.resolve()) for path in paths}
-    found: dict[tuple[str, str], list[FunctionType]] = {}
-    for each in gc.get_objects():
-        if isinstance(each, FunctionType) and each.__code__.co_filename in files:
-            place = each.__code__.co_filename, each.__code__.co_qualname
-            found.setdefault(place, []).append(each)
-    return found
-
-
-def select_tests(mutant: Mutant, baseline: Baseline) -> list[int]:
-    """Return the tests that reach a mutant, quick ones first."""
-    reached = baseline.reached.get(str(mutant.path.resolve()), {})
-    if mutant.is_constant:
-        lines = {
-            line
-            for node in ast.walk(mutant.tree)
-            if isinstance(node, ast.Name) and node.id == mutant.scope
-            for line in range(node.lineno - 3, node.lineno + 4)
-        }
-    else:
-        lines = set(range(mutant.lines[0], mutant.lines[1] + 1))
-    tests = {test for line in lines for test in reached.get(line, [])}
-    return sorted(tests, key=lambda test: baseline.seconds[test])
-
-
-def install(mutant: Mutant, functions: dict[tuple[str, str], list[FunctionType]]) -> bool:
+def install(mutant: Mutant) -> bool:
     """Put a mutant in the place of what is imported; False where it cannot be."""
     mutant.plant()
-    file = str(mutant.path.resolve())
+    file = str(mutant.path)
     module = compile(mutant.tree, file, "exec", dont_inherit=True)
-    if mutant.is_constant:
-        return _replace_constant(mutant, file)
-    targets = functions.get((file, mutant.scope), [])
-    codes = {code.co_firstlineno: code for code in _codes(module, mutant.scope)}
-    for function in targets:
-        try:
-            function.__code__ = codes[function.__code__.co_firstlineno]
-        except (KeyError, ValueError):
-            return False
-        if isinstance(mutant.parent, ast.arguments):
-            _replace_default(mutant, function)
-    return bool(targets)
+    codes = {code.co_firstlineno: code for code in _codes(module, mutant.function)}
+    gc.unfreeze()
+    functions = [
+        each
+        for each in gc.get_objects()
+        if isinstance(each, FunctionType)
+        and (each.__code__.co_filename, each.__code__.co_qualname) == (file, mutant.function)
+    ]
+    for function in functions:
+        function.__code__ = codes[function.__code__.co_firstlineno]
+    return bool(functions)
 
 
-def _codes(code: CodeType, name: str) -> Iterable[CodeType]:
+def _run_test(session: pytest.Session, index: int, following: int | None) -> None:
+    item = session.items[index]
+    next_item = None if following is None else session.items[following]
+    item.ihook.pytest_runtest_protocol(item=item, nextitem=next_item)
+
+
+def _codes(code: CodeType, name: str) -> Iterator[CodeType]:
     for each in code.co_consts:
         if isinstance(each, CodeType):
             if each.co_qualname == name:
                 yield each
             yield from _codes(each, name)
-
-
-def _replace_default(mutant: Mutant, function: FunctionType) -> None:
-    value = ast.literal_eval(ast.unparse(mutant.node))
-    if mutant.field == "kw_defaults":
-        name = mutant.parent.kwonlyargs[mutant.index].arg
-        function.__kwdefaults__ = {**(function.__kwdefaults__ or {}), name: value}
-    else:
-        old = function.__defaults__ or ()
-        function.__defaults__ = (*old[: mutant.index], value, *old[mutant.index + 1 :])
-
-
-def _replace_constant(mutant: Mutant, file: str) -> bool:
-    """Give a constant its changed value, wherever it was imported."""
-    home = next(m for m in sys.modules.values() if getattr(m, "__file__", None) == file)
-    old = vars(home).get(mutant.scope)
-    statement = next(
-        each
-        for each in mutant.tree.body
-        if isinstance(each, ast.Assign) and ast.unparse(each.targets[0]) == mutant.scope
-    )
-    scratch = dict(vars(home))
-    exec(compile(ast.Module([statement], []), file, "exec"), scratch)  # the file's own text
-    for module in list(sys.modules.values()):
-        if vars(module).get(mutant.scope) is old and old is not None:
-            setattr(module, mutant.scope, scratch[mutant.scope])
-    return old is not None
-
-
-def _ended(deadlines: dict[int, float]) -> list[tuple[int, str]]:
-    """Wait for forks to end; those beyond their time are ended."""
-    while True:
-        found = []
-        for pid, deadline in deadlines.items():
-            done, status = os.waitpid(pid, os.WNOHANG)
-            if done:
-                found.append((pid, _result(status)))
-            elif time.monotonic() > deadline:
-                os.killpg(pid, signal.SIGKILL)
-                os.waitpid(pid, 0)
-                found.append((pid, TIMEOUT))
-        if found:
-            return found
-        time.sleep(0.01)
-
-
-def _result(status: int) -> str:
-    if os.WIFSIGNALED(status):
-        return TIMEOUT if os.WTERMSIG(status) == signal.SIGPROF else KILLED
-    return {0: SURVIVED, 3: UNUSABLE}.get(os.WEXITSTATUS(status), KILLED)
 
 
 def _hush() -> None:
@@ -313,9 +337,43 @@ def _hush() -> None:
         os.dup2(nothing, stream)
 
 
-def _text(path: Path) -> str:
-    return path.read_text(encoding="utf-8") if path.exists() else ""
+def wilson(n_found: int, n: int) -> tuple[float, float]:
+    """Return the 95 % interval of a share of which a sample is known."""
+    z, share = 1.96, n_found / n
+    middle = share + z * z / (2 * n)
+    half = z * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
+    return (middle - half) / (1 + z * z / n), (middle + half) / (1 + z * z / n)
 
 
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+def main() -> int:
+    """Parse the arguments, plant the faults, and return 1 where too few are noticed."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--paths", nargs="+", default=PATHS, help="files or folders to change")
+    parser.add_argument("--tests", nargs="+", default=TESTS, help="tests that should notice")
+    parser.add_argument("--sample", type=int, default=200, metavar="N")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=2)
+    arguments = parser.parse_args()
+    os.chdir(ROOT)
+    given = [Path(path).resolve() for path in arguments.paths]
+    files = [file for path in given for file in (sorted(path.rglob("*.py")) or [path])]
+    every = [mutant for file in files if file.exists() for mutant in mutants_of(file)]
+    random.Random(arguments.seed).shuffle(every)
+    mutation = Mutation(mutants=every[: arguments.sample], jobs=arguments.jobs)
+    tests = [test for test in arguments.tests if Path(test).exists()]
+    options = ["-q", "-p", "no:cacheprovider", "-n", "0", "--assert=plain"]
+    with Path(os.devnull).open("w") as nothing, redirect_stdout(nothing):
+        code = pytest.main([*options, *tests], plugins=[mutation])
+    if code not in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED):
+        return int(code)
+    n_killed = mutation.n_run - len(mutation.survivors)
+    low, high = wilson(n_killed, mutation.n_run)
+    print(
+        f"{n_killed} of {mutation.n_run} noticed ({100 * n_killed / mutation.n_run:.1f} %); "
+        f"{100 * low:.1f} to {100 * high:.1f} % of all {len(every)}"
+    )
+    return int(n_killed < MIN_KILLED * mutation.n_run)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
