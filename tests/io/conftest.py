@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gvo.geometry.camera import Calibration, PinholeCamera
 from gvo.io.recording import RecordingInfo, Sensor, StampedImage
 from gvo.trajectory.trajectory import Trajectory
+from gvo.types import FaultyFrame, Frame, StereoFrame
 
 _WIDTH, _HEIGHT = 48, 32
 
@@ -160,6 +161,14 @@ class Tiny:
             (folder / f"{stream}.txt").write_text("\n".join(rows) + "\n")
         (folder / "calibration.yaml").write_text(yaml.safe_dump(self.ros_camera()))
         return folder
+
+    def fingerprint(self, frame: Frame | FaultyFrame) -> tuple[object, ...]:
+        """Return all that a frame holds, comparable bit by bit."""
+        if isinstance(frame, FaultyFrame):
+            return ("faulty", frame.stamp_ns, frame.reason)
+        if isinstance(frame, StereoFrame):
+            return ("stereo", frame.stamp_ns, frame.left.tobytes(), frame.right.tobytes())
+        return ("rgbd", frame.stamp_ns, frame.image.tobytes(), frame.depth.tobytes())
 
 
 def _give(pixels: NDArray[Any] | Exception) -> NDArray[Any]:
