@@ -16,7 +16,7 @@ from gvo.io.synthetic import SyntheticRecording
 from gvo.io.synthetic.worlds.motion import look_around
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
-from tests.io.pose_bags import PoseBag
+from tests.make.bags import PoseBag
 
 N_FRAMES = 16
 CAMERA = "camera_left_optical"

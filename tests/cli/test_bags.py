@@ -19,7 +19,7 @@ from gvo.io.recording import StampedImage
 from gvo.trajectory.formats import read_trajectory
 from gvo.types import FloatArray, IntArray
 from tests.conftest import Command, assert_same_files, interrupt, refused, start
-from tests.io.pose_bags import ODOMETRY, PoseBag
+from tests.make.bags import ODOMETRY, PoseBag
 from tests.rendered_walk import (
     CAMERA,
     GLOBAL,

@@ -17,7 +17,7 @@ from gvo.io.bag.messages import (
 from gvo.io.images import GreyRange
 from tests.fuzz.mutations import mutate_picture
 from tests.fuzz.target import Choices, Target
-from tests.io.rvl_coder import encode_rvl
+from tests.make.rvl import encode_rvl
 
 _FORMATS = (
     *("jpeg", "png", "rgb8; jpeg compressed bgr8", "rgb8; tiff compressed rgb8"),

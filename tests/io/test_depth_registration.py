@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from gvo.geometry.camera import Calibration, PinholeCamera, rectification_maps
-from gvo.geometry.se3 import invert, make_transform
+from gvo.geometry.camera import Calibration, PinholeCamera
+from gvo.geometry.se3 import make_transform
 from gvo.io.depth_registration import DepthRegistration
 from gvo.io.recording import DepthView
 from gvo.io.synthetic.rendering import StillScene
@@ -167,23 +167,6 @@ def test_the_view_of_the_colour_camera_itself_changes_no_bit(is_rectified: bool)
     np.testing.assert_array_equal(registered, depth)
 
 
-def test_a_distorted_view_from_the_same_place_is_rectified_as_colour_is() -> None:
-    raw = replace(
-        Calibration.from_camera(_HALF), D=np.array([-0.2, 0.05, 0.001, 0, 0]), is_rectified=False
-    )
-    v, u = np.mgrid[:240, :320]
-    depth = (2.0 + 1e-3 * u + 5e-4 * v).astype(np.float32)
-    view = DepthView(calibration=raw, T_color_depth=np.eye(4))
-    registered = DepthRegistration(Calibration.from_camera(_HALF), view)(depth)
-    maps = rectification_maps(raw)
-    assert maps is not None
-    expected = cv2.remap(depth, *maps, cv2.INTER_LINEAR, borderValue=np.nan)
-    is_known = np.isfinite(expected) & np.isfinite(registered)
-    assert is_known.mean() > 0.95
-    # the value of a pixel that lies up to a pixel away
-    assert np.abs(registered - expected)[is_known].max() < 2e-3
-
-
 def test_unknown_depth_stays_unknown_and_moves_with_what_surrounds_it() -> None:
     depth = np.full((480, 640), 2.0, np.float32)
     depth[200:240, 300:340] = np.nan
@@ -198,17 +181,6 @@ def test_points_behind_the_colour_camera_are_left_out() -> None:
     T_color_depth = make_transform(np.eye(3), np.array([0.0, 0.0, -1.0]))
     depth = np.full((480, 640), 0.5, np.float32)
     assert np.all(np.isnan(_registration(_COLOR, T_color_depth)(depth)))
-
-
-def test_registration_and_its_inverse_give_back_the_depth() -> None:
-    T = make_transform(_TURN, np.array([0.03, 0.01, 0.0]))
-    v, u = np.mgrid[:480, :640]
-    depth = (2.0 + 2e-4 * u - 3e-4 * v).astype(np.float32)
-    there = _registration(_COLOR, T)(depth)
-    back = _registration(_COLOR, invert(T))(there)
-    is_known = np.isfinite(back)
-    assert is_known.mean() > 0.9
-    assert np.abs(back - depth)[is_known].max() < 1.5e-3  # a pixel either way
 
 
 def test_wrong_use_is_refused() -> None:

@@ -64,16 +64,6 @@ def test_all_is_kept_by_default() -> None:
     assert list(take_excerpt([], Excerpt())) == []
 
 
-def test_start_and_duration_count_from_the_first_image() -> None:
-    taken = take_excerpt(_items(_TENTHS), Excerpt(start_s=1.0, duration_s=0.5))
-    assert _seconds(taken) == [1.0, 1.1, 1.2, 1.3, 1.4]
-
-
-def test_every_third_frame_is_the_first_and_then_each_third() -> None:
-    taken = take_excerpt(_items(_TENTHS), Excerpt(start_s=4.0, every=3))
-    assert _seconds(taken) == [4.0, 4.3, 4.6, 4.9]
-
-
 @given(items=_recordings, cut=st.integers(1, 100), every=st.integers(1, 5))
 def test_an_excerpt_is_as_defined(items: list[Pair | FaultyFrame], cut: int, every: int) -> None:
     excerpt = Excerpt(start_s=cut / 10, duration_s=cut / 7, every=every)
@@ -106,16 +96,6 @@ def test_excerpts_that_follow_one_another_hold_each_frame_once(
         except RecordingError:
             assert _stamp_ns(items[-1]) - _FIRST_NS < cut_s * _SECOND
     assert parts == items
-
-
-def test_colour_of_twice_the_rate_of_depth_is_counted_by_pairs() -> None:
-    images = [_image(0, 33_000_000 * n) for n in range(60)]
-    images += [_image(1, 66_000_000 * n) for n in range(30)]
-    images.sort(key=lambda image: image.stamp_ns)
-    pairs = pair_images(images, limit_ns=10_000_000, partner="depth")
-    taken = list(take_excerpt(pairs, Excerpt(every=2)))
-    stamps = [item[0].stamp_ns for item in taken if not isinstance(item, FaultyFrame)]
-    assert stamps == [132_000_000 * n for n in range(15)]
 
 
 def test_a_faulty_frame_is_given_where_a_frame_is_due() -> None:
@@ -163,16 +143,6 @@ def test_an_excerpt_after_the_end_tells_how_long_the_recording_is() -> None:
 def test_an_excerpt_in_a_gap_tells_where_the_recording_goes_on() -> None:
     with pytest.raises(RecordingError, match=r"between 3 and 3\.5 s: .* goes on to 8 s"):
         list(take_excerpt(_items([0, 1, 2, 8]), Excerpt(start_s=3, duration_s=0.5)))
-
-
-def test_what_reading_raises_comes_through() -> None:
-    def items() -> Iterator[Pair | FaultyFrame]:
-        yield _item(0)
-        raise RecordingError("cut off")
-
-    taken = take_excerpt(items(), Excerpt(start_s=1))
-    with pytest.raises(RecordingError, match="cut off"):
-        next(taken)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +15,9 @@ import pytest
 from gvo.config import Config, RuntimeConfig, SyncConfig
 from gvo.errors import CalibrationError, RecordingError
 from gvo.geometry.camera import Calibration, PinholeCamera, StereoCamera
-from gvo.io.datasets.kitti import KittiSource
-from gvo.io.datasets.tum import TumSource
 from gvo.io.depth_registration import DepthRegistration
 from gvo.io.frames import Rig, frames, refuse_repeats
 from gvo.io.recording import DepthView, StampedImage
-from gvo.io.sync import pair_images
 from gvo.types import FaultyFrame, Frame, RgbdFrame, StereoFrame
 
 _THREADS = pytest.mark.parametrize("threads", [1, 2, 4])
@@ -256,23 +252,6 @@ def test_an_image_that_no_thread_has_begun_is_not_waited_for(tiny: Any, threads:
     assert found == [True]
 
 
-def test_reading_can_be_stopped(tiny: Any) -> None:
-    loaded = []
-    source = tiny.stereo([(s, n, tiny.texture(n)) for n in range(50) for s in (0, 1)])
-    whole = source.images
-
-    def counting() -> Iterator[StampedImage]:
-        for image in whole():
-            loaded.append(image.stamp_ns)
-            yield image
-
-    source.images = counting
-    iterator = frames(source, Config())
-    next(iterator)
-    iterator.close()  # type: ignore[attr-defined]
-    assert len(loaded) <= 8
-
-
 @pytest.mark.parametrize("is_closed", [True, False])
 def test_a_reading_that_is_given_up_leaves_no_thread_behind(tiny: Any, is_closed: bool) -> None:
     source = tiny.stereo([(s, n, tiny.texture(n)) for n in range(50) for s in (0, 1)])
@@ -287,44 +266,6 @@ def test_a_reading_that_is_given_up_leaves_no_thread_behind(tiny: Any, is_closed
 
 def _decoding_threads() -> list[str]:
     return [thread.name for thread in threading.enumerate() if thread.name.startswith("decode")]
-
-
-@pytest.mark.recorded
-def test_recorded_depth_is_the_count_of_the_nearest_pixel(gvo_data: Path) -> None:
-    source = TumSource(gvo_data / "rgbd_dataset_freiburg1_xyz_start")
-    frame = next(item for item in frames(source, Config()) if isinstance(item, RgbdFrame))
-    _, second = next(
-        pair
-        for pair in pair_images(source.images(), limit_ns=20_000_000, partner="depth")
-        if isinstance(pair, tuple) and pair[0].stamp_ns == frame.stamp_ns
-    )
-    depth_images = (image for image in source.images() if image.stream == 1)
-    stamps = {image.stamp_ns: n for n, image in enumerate(depth_images)}
-    table = (gvo_data / "rgbd_dataset_freiburg1_xyz_start" / "depth.txt").read_text()
-    rows = [line.split()[1] for line in table.splitlines() if not line.startswith("#")]
-    path = gvo_data / "rgbd_dataset_freiburg1_xyz_start" / rows[stamps[second.stamp_ns]]
-    counts = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
-    camera = source.info.calibrations[0]
-    rng = np.random.default_rng(0)
-    for u, v in rng.integers([0, 0], [640, 480], size=(3000, 2)):
-        ray = np.linalg.solve(camera.P[:, :3], [u, v, 1.0])
-        raw, _ = cv2.projectPoints(ray[np.newaxis], np.zeros(3), np.zeros(3), camera.K, camera.D)
-        column, row = np.rint(raw.ravel()).astype(int)
-        if np.abs(np.abs(raw.ravel() - [column, row]) - 0.5).min() < 1e-3:
-            continue  # a tie, for single precision
-        is_inside = 0 <= column < 640 and 0 <= row < 480
-        count = int(counts[row, column]) if is_inside else 0
-        expected = np.nan if count in (0, 65535) else np.float32(count) / np.float32(5000)
-        np.testing.assert_equal(float(frame.depth[v, u]), float(expected))
-
-
-@pytest.mark.recorded
-def test_the_number_of_threads_changes_nothing(gvo_data: Path, tiny: Any) -> None:
-    source = KittiSource(gvo_data / "kitti_06_start")
-    read = (frames(source, Config(runtime=RuntimeConfig(threads=n))) for n in (1, 2))
-    one, two = ([tiny.fingerprint(frame) for frame in islice(items, 12)] for items in read)
-    assert one == two
-    assert len(one) == 12
 
 
 _RNG = np.random.default_rng(0)

@@ -25,7 +25,7 @@ from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Optimum, Progress
 from tests import faults as made
 from tests.conftest import Command, run_of
-from tests.io.pose_bags import PoseBag
+from tests.make.bags import PoseBag
 from tests.rendered_walk import (
     CAMERA,
     GLOBAL,

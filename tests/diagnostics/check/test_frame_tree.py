@@ -12,7 +12,7 @@ from gvo.diagnostics.check.findings import Finding
 from gvo.diagnostics.check.frame_tree import check_frame_tree
 from gvo.io.poses.tf import TfBuffer
 from tests.diagnostics.check.planted import check, complaints, render
-from tests.io.pose_bags import add_transform
+from tests.make.bags import add_transform
 
 S = 1_000_000_000
 STAMPS_NS = np.arange(0, 10 * S, S // 10, dtype=np.int64)

@@ -14,11 +14,11 @@ from gvo.errors import CalibrationError
 from gvo.geometry import se3
 from gvo.geometry.camera import rectification_maps
 from gvo.io.bag.calibration import BagCalibration, calibrations_of_file, calibrations_of_messages
-from gvo.io.bag.reader import TF_TYPE, BagReader
+from gvo.io.bag.reader import BagReader
 from gvo.io.bag.topics import COMPRESSED_TYPE, IMAGE_TYPE, TopicChoice, choose_topics
 from gvo.io.calibration.camera_info import stereo_baseline
 from gvo.types import FloatArray
-from tests.io.camera_bags import Message, camera_info, header, image, make, write
+from tests.make.bags import Message, camera_info, header, image, make, tf, write
 
 _P = [50.0, 0, 23.5, 0, 0, 50.0, 15.5, 0, 0, 0, 1, 0]
 _D = [-0.2, 0.05, 0.001, -0.002, 0.0]
@@ -28,31 +28,8 @@ def _image(topic: str, size: tuple[int, int] = (48, 32), frame_id: str = "camera
     return image(topic, np.zeros(size[::-1], np.uint8), header=header(frame_id))
 
 
-def _transform(T: FloatArray) -> Any:
-    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
-    return make(
-        "geometry_msgs/msg/Transform",
-        translation=make("geometry_msgs/msg/Vector3", **dict(zip("xyz", T[:3, 3], strict=True))),
-        rotation=make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
-    )
-
-
-def _tf(topic: str, parent: str, child: str, T: FloatArray, stamp_ns: int = 0) -> Message:
-    transform = make(
-        "geometry_msgs/msg/TransformStamped",
-        header=header(parent, stamp_ns),
-        child_frame_id=child,
-        transform=_transform(T),
-    )
-    return topic, TF_TYPE, stamp_ns, make(TF_TYPE, transforms=[transform])
-
-
-def _bag(path: Path, messages: Sequence[Message]) -> BagReader:
-    return BagReader(write(path, messages))
-
-
 def _found(path: Path, messages: Sequence[Message], **choice: str) -> BagCalibration:
-    reader = _bag(path, messages)
+    reader = BagReader(write(path, messages))
     topics = choose_topics(reader.topics, TopicChoice(**choice), "the bag")
     return calibrations_of_messages(reader, topics, "the bag")
 
@@ -80,8 +57,8 @@ def _pair(name: str = "image_raw", **changes: Any) -> list[Message]:
 
 def _mounts(topic: str = "/tf_static", stamp_ns: int = 0) -> list[Message]:
     return [
-        _tf(topic, "body", "left_optical", _T_BODY_LEFT, stamp_ns),
-        _tf(topic, "body", "right_optical", _T_BODY_LEFT @ _T_LEFT_RIGHT, stamp_ns),
+        tf(topic, "body", "left_optical", _T_BODY_LEFT, stamp_ns),
+        tf(topic, "body", "right_optical", _T_BODY_LEFT @ _T_LEFT_RIGHT, stamp_ns),
     ]
 
 
@@ -89,7 +66,7 @@ def _mounts(topic: str = "/tf_static", stamp_ns: int = 0) -> list[Message]:
     ("model", "D"), [("plumb_bob", _D), ("equidistant", [0.01, -0.002, 0.001, 0.0])]
 )
 @pytest.mark.parametrize(("topic", "stamp_ns"), [("/tf_static", 0), ("/tf", 7_000_000_000)])
-def test_raw_cameras_without_baseline_are_rectified_by_tf(
+def test_raw_cameras_without_baseline_are_rectified_bytf(
     tmp_path: Path, model: str, D: list[float], topic: str, stamp_ns: int
 ) -> None:
     messages = [*_pair(distortion_model=model, D=D), *_mounts(topic, stamp_ns)]
@@ -120,19 +97,19 @@ def test_raw_cameras_without_baseline_are_rectified_by_tf(
     assert uv[True][0] - uv[False][0] == pytest.approx(left.P[0, 0] * baseline / depth)
 
 
-def test_rectified_images_without_baseline_take_it_from_tf(tmp_path: Path) -> None:
+def test_rectified_images_without_baseline_take_it_fromtf(tmp_path: Path) -> None:
     T = _pose([0, 0, 0], [0.25, 0, 0])
-    messages = [*_pair("image_rect", P=_P), _tf("/tf_static", "left_optical", "right_optical", T)]
+    messages = [*_pair("image_rect", P=_P), tf("/tf_static", "left_optical", "right_optical", T)]
     left, right = _found(tmp_path / "a.bag", messages).calibrations
     assert left.is_rectified
     assert right.P[0, 3] == pytest.approx(-50 * 0.25)
     T = _pose([0, 0.05, 0], [0.25, 0, 0])
-    messages[-1] = _tf("/tf_static", "left_optical", "right_optical", T)
+    messages[-1] = tf("/tf_static", "left_optical", "right_optical", T)
     with pytest.raises(CalibrationError, match=r"turned by 2\.86 deg .* --calibration FILE"):
         _found(tmp_path / "b.bag", messages)
 
 
-def test_a_baseline_of_p_wins_over_tf(tmp_path: Path) -> None:
+def test_a_baseline_of_p_wins_overtf(tmp_path: Path) -> None:
     messages = [*_pair(P=_P), *_mounts()]
     info = camera_info("/s/right/camera_info", "right_optical", P=[*_P[:3], -25.0, *_P[4:]])
     messages[3] = info
@@ -185,8 +162,8 @@ _T_COLOR_DEPTH = _pose([0.01, 0.02, -0.01], [0.015, 0.001, -0.002])
 
 def test_depth_of_another_camera_comes_with_its_calibration_and_place(tmp_path: Path) -> None:
     # The tf tree is up to the other side: the depth camera is the parent of the colour camera.
-    tf = _tf("/tf_static", "depth_optical", "color_optical", se3.invert(_T_COLOR_DEPTH))
-    found = _found(tmp_path / "a.bag", [*_rgbd(K=_DEPTH_K, width=64, D=_D), tf])
+    mount = tf("/tf_static", "depth_optical", "color_optical", se3.invert(_T_COLOR_DEPTH))
+    found = _found(tmp_path / "a.bag", [*_rgbd(K=_DEPTH_K, width=64, D=_D), mount])
     view = found.depth_view
     assert view is not None
     np.testing.assert_allclose(view.T_color_depth, _T_COLOR_DEPTH, atol=1e-9)
@@ -198,13 +175,13 @@ def test_depth_of_another_camera_comes_with_its_calibration_and_place(tmp_path: 
 
 
 def test_the_place_alone_makes_a_camera_of_its_own(tmp_path: Path) -> None:
-    tf = _tf("/tf_static", "color_optical", "depth_optical", _T_COLOR_DEPTH)
-    view = _found(tmp_path / "a.bag", [*_rgbd(), tf]).depth_view
+    mount = tf("/tf_static", "color_optical", "depth_optical", _T_COLOR_DEPTH)
+    view = _found(tmp_path / "a.bag", [*_rgbd(), mount]).depth_view
     assert view is not None
     np.testing.assert_allclose(view.T_color_depth, _T_COLOR_DEPTH, atol=1e-9)
 
 
-def test_depth_of_one_frame_and_other_intrinsics_needs_no_tf(tmp_path: Path) -> None:
+def test_depth_of_one_frame_and_other_intrinsics_needs_notf(tmp_path: Path) -> None:
     depths: list[dict[str, Any]] = [{"K": _DEPTH_K}, {"width": 64}]
     for n, changes in enumerate(depths):
         view = _found(tmp_path / f"{n}.bag", _rgbd(frame_id="color_optical", **changes)).depth_view
@@ -223,11 +200,11 @@ def test_depth_of_one_frame_and_other_intrinsics_needs_no_tf(tmp_path: Path) -> 
     ],
 )
 def test_registered_depth_is_left_alone(tmp_path: Path, name: str, depth: dict[str, Any]) -> None:
-    tf = [
-        _tf("/tf_static", "color_optical", "depth_optical", _T_COLOR_DEPTH),
-        _tf("/tf_static", "color_optical", "coincident", np.eye(4)),
+    mounts = [
+        tf("/tf_static", "color_optical", "depth_optical", _T_COLOR_DEPTH),
+        tf("/tf_static", "color_optical", "coincident", np.eye(4)),
     ]
-    found = _found(tmp_path / "a.bag", [*_rgbd(name, **depth), *tf])
+    found = _found(tmp_path / "a.bag", [*_rgbd(name, **depth), *mounts])
     assert found.depth_view is None
     assert not any(line.startswith("depth: ") for line in found.decisions)
 
@@ -251,7 +228,7 @@ def test_a_depth_camera_without_calibration_is_taken_as_registered(tmp_path: Pat
 
 
 def test_a_file_wins_and_names_body_and_frame(tmp_path: Path, tiny: Any) -> None:
-    reader = _bag(tmp_path / "a.bag", [m for m in _pair() if m[1] == IMAGE_TYPE])
+    reader = BagReader(write(tmp_path / "a.bag", [m for m in _pair() if m[1] == IMAGE_TYPE]))
     topics = choose_topics(reader.topics, TopicChoice(), "")
     camera = {
         "intrinsics": [50.0, 50.0, 23.5, 15.5],

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from gvo.errors import RecordingError
 from gvo.io.bag.image_encodings import decode_rvl
-from tests.io.rvl_coder import encode_rvl
+from tests.make.rvl import encode_rvl
 
 _COUNTS = st.one_of(st.just(0), st.integers(0, 65535), st.integers(990, 1010), st.just(65535))
 

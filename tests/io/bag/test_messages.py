@@ -19,7 +19,7 @@ from gvo.io.bag.messages import (
     stamp_of,
 )
 from gvo.io.images import GreyRange
-from tests.io.rvl_coder import encode_rvl
+from tests.make.rvl import encode_rvl
 
 
 def _message(

@@ -5,8 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from gvo.errors import RecordingError
@@ -16,7 +14,7 @@ from gvo.io.bag.reader import BagReader
 from gvo.io.edges.events import InputFaults
 from gvo.io.edges.pose_streams import PoseSample
 from gvo.types import FloatArray
-from tests.io.pose_bags import ODOMETRY, STAMPED, TRANSFORM, PoseBag
+from tests.make.bags import ODOMETRY, STAMPED, TRANSFORM, PoseBag
 
 N = 4
 
@@ -72,16 +70,6 @@ def test_the_covariance_of_a_message_is_that_of_its_own_perturbations(tmp_path: 
         assert C is not None
         scale = np.sqrt(np.outer(np.diag(C), np.diag(C)))
         assert np.abs((C - expected) / scale).max() < 0.06
-
-
-@given(st.integers(0, 2**32 - 1))
-def test_conversion_from_ros_order_undoes_the_published_formula(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    A = rng.normal(size=(6, 6))
-    R = np.asarray(Rotation.random(rng=rng).as_matrix())
-    P = np.block([[np.zeros((3, 3)), R], [R, np.zeros((3, 3))]])
-    C = A @ A.T
-    np.testing.assert_allclose(se3.covariance_from_ros(P @ C @ P.T, R), C, atol=1e-12)
 
 
 def test_messages_without_a_rotation_are_skipped_and_counted(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from gvo.config import Config
-from gvo.errors import CalibrationError, GvoError, RecordingError
+from gvo.errors import CalibrationError, RecordingError
 from gvo.io.bag.cameras import find_contradiction
 from gvo.io.bag.recovery.scan import Channel
 from gvo.io.bag.source import BagSource
@@ -18,7 +18,7 @@ from gvo.io.frames import frames
 from gvo.io.opening import open_recording
 from gvo.io.poses.inputs import describe_camera_changes
 from gvo.types import FaultyFrame, RgbdFrame, StereoFrame
-from tests.io.camera_bags import K, Message, camera_info, image, write
+from tests.make.bags import Message, camera_info, image, write
 
 _P_LEFT = [50.0, 0, 23.5, 0, 0, 50.0, 15.5, 0, 0, 0, 1, 0]
 _P_RIGHT = [50.0, 0, 23.5, -25.0, 0, 50.0, 15.5, 0, 0, 0, 1, 0]
@@ -93,17 +93,6 @@ def test_depth_is_in_metres(
     np.testing.assert_allclose(frame.depth, factor * tiny.depth(1), rtol=1e-6)
 
 
-def test_depth_of_another_camera_is_registered(tmp_path: Path, tiny: Any) -> None:
-    messages = _rgbd(tiny, tiny.counts(1), "16UC1")
-    other = _info("/c/depth/camera_info", _P_LEFT, K=np.array([40.0, *K[1:]]))
-    view = BagSource(write(tmp_path / "a.bag", [*messages, other])).info.depth_view
-    assert view is not None
-    np.testing.assert_array_equal(view.T_color_depth, np.eye(4))
-    assert view.calibration.K[0, 0] == 40.0
-    same = _info("/c/depth/camera_info", _P_LEFT)
-    assert BagSource(write(tmp_path / "b.bag", [*messages, same])).info.depth_view is None
-
-
 def test_each_faulty_image_is_one_faulty_frame(tmp_path: Path, tiny: Any) -> None:
     messages = _stereo(tiny)
     left = "/s/left/image_rect"
@@ -143,11 +132,8 @@ def test_a_calibration_file_replaces_camera_info(tmp_path: Path, tiny: Any) -> N
 @pytest.mark.parametrize(
     ("info", "text"),
     [
-        ({"distortion_model": "fov", "D": np.full(4, 0.1)}, "'fov'"),
         ({"K": np.zeros(9), "P": np.zeros(12)}, "not calibrated"),
         ({"P": np.zeros(12)}, "baseline must be positive"),
-        ({"R": np.full(9, 7.0)}, "R is no rotation"),
-        ({"K": np.full(9, np.nan)}, "not finite"),
         ({"width": 2**31}, "at most 32767 px a side .* got 2147483648x32"),
     ],
 )
@@ -156,20 +142,6 @@ def test_a_bad_info_is_refused(tmp_path: Path, tiny: Any, info: dict[str, Any], 
     with pytest.raises(CalibrationError, match=text) as caught:
         BagSource(bag)
     assert str(caught.value).startswith(str(bag))
-
-
-def test_depth_of_a_camera_that_rectification_turns_is_refused(tmp_path: Path, tiny: Any) -> None:
-    R = np.array([0.8, 0, 0.6, 0, 1, 0, -0.6, 0, 0.8])
-    messages = _rgbd(tiny, tiny.depth(0), "32FC1")
-    messages[0] = _info("/c/rgb/camera_info", _P_LEFT, R=R)
-    with pytest.raises(CalibrationError, match=r"/c/rgb/camera_info: R turns the camera"):
-        BagSource(write(tmp_path / "a.bag", messages))
-    content = tiny.ros_camera(rectification_matrix={"data": R.tolist()})
-    file = tmp_path / "turned.yaml"
-    file.write_text(yaml.safe_dump(content))
-    bag = write(tmp_path / "b.bag", _rgbd(tiny, tiny.depth(0), "32FC1"))
-    with pytest.raises(CalibrationError, match=r"turned\.yaml: R turns the camera"):
-        BagSource(bag, calibration=file)
 
 
 def test_bags_of_two_cameras_are_not_one_recording(tmp_path: Path, tiny: Any) -> None:
@@ -231,55 +203,22 @@ def test_images_without_stamps_take_those_of_the_recording(tmp_path: Path, tiny:
     assert [item.stamp_ns for item in stamped] == left
 
 
-_RECORDED = (
-    *("bad/assertion_in_reader.bag", "bad/damaged.bag", "bad/empty-file.bag"),
-    *("bad/empty_message_definition.bag", "bad/no-messages.bag", "bad/not_a_bag.mcap"),
-    *("bad/old_type_names.db3", "bad/silent_zero_messages_mcap"),
-    *("bad/silent_zero_messages_mcap/talker.mcap", "bad/silent_zero_messages_sqlite3"),
-    *("bad/silent_zero_messages_sqlite3/talker.db3", "bad/truncated.bag", "bad/truncated.mcap"),
-    *("bad/unindexed.bag", "bad/version1.bag", "good/compressed_image.bag"),
-    *("good/nav2_turtlebot.mcap", "good/pose_streams.bag", "good/realsense_rgbd.bag"),
-    *("good/ros2_all_types_mcap", "good/ros2_all_types_mcap/test_bag_mcap.mcap"),
-    *("good/ros2_all_types_sqlite3", "good/ros2_all_types_sqlite3/test_bag_sqlite3.db3"),
-    *("good/tf_bz2.bag", "good/tf_example.bag", "good/tf_example_ros2"),
-    *("good/tf_example_ros2/tf_example.db3", "good/tf_lz4.bag", "good/tf_uncompressed.bag"),
-)
-_OPENING = ("good/realsense_rgbd.bag",)
-
-
 @pytest.mark.recorded
-@pytest.mark.parametrize("name", _RECORDED)
-def test_every_recorded_bag_opens_or_is_refused_in_one_line(gvo_data: Path, name: str) -> None:
-    path = gvo_data / "bags" / name
-    assert path.exists()
-    if name in _OPENING:
-        assert len(list(frames(open_recording(path), Config()))) == 1
-        return
-    with pytest.raises(RecordingError) as caught:
-        open_recording(path)
-    assert str(caught.value).startswith(f"{path}: ")
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.recorded
-def test_no_recorded_bag_is_left_out(gvo_data: Path) -> None:
-    found = {f"{path.parent.name}/{path.name}" for path in (gvo_data / "bags").glob("*/*")}
-    assert found == {name for name in _RECORDED if name.count("/") == 1}
-
-
-@pytest.mark.recorded
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("bad/version1.bag", "older format"),
-        ("bad/empty-file.bag", "empty"),
-        ("good/nav2_turtlebot.mcap", "no image topics; it holds /odom"),
-        ("good/compressed_image.bag", "one camera alone"),
-    ],
-)
-def test_the_message_says_what_to_do(gvo_data: Path, name: str, words: str) -> None:
-    with pytest.raises(GvoError, match=words):
-        open_recording(gvo_data / "bags" / name)
+def test_every_recorded_bag_opens_or_is_refused_in_one_line(gvo_data: Path) -> None:
+    words = {
+        "version1.bag": "older format",
+        "empty-file.bag": "empty",
+        "nav2_turtlebot.mcap": "no image topics; it holds /odom",
+        "compressed_image.bag": "one camera alone",
+    }
+    for path in sorted((gvo_data / "bags").glob("*/*")):
+        if path.name == "realsense_rgbd.bag":
+            assert len(list(frames(open_recording(path), Config()))) == 1
+            continue
+        with pytest.raises(RecordingError, match=words.get(path.name)) as caught:
+            open_recording(path)
+        assert str(caught.value).startswith(f"{path}: ")
+        assert "\n" not in str(caught.value)
 
 
 @pytest.mark.recorded

@@ -64,38 +64,11 @@ def test_the_truth_is_that_of_the_rectified_left_camera(tmp_path: Path, tiny: An
     assert truth.stamps_ns.tolist() == [_STAMPS[0]]
 
 
-@pytest.mark.parametrize(
-    ("changes", "text"),
-    [
-        ({"camera_model": "omni"}, "camera model 'omni'"),
-        ({"distortion_model": "fov", "distortion_coefficients": [0.1]}, "distortion model 'fov'"),
-        ({"intrinsics": [1.0, 2.0]}, "intrinsics must hold 4"),
-        ({"resolution": None}, "resolution must hold"),
-        ({"T_BS": {"data": [1.0] * 16}}, "T_BS must have .0, 0, 0, 1. as its last row"),
-        ({"T_BS": "none"}, "T_BS must hold numbers"),
-    ],
-)
-def test_a_malformed_sensor_is_refused(
-    tmp_path: Path, tiny: Any, changes: dict[str, Any], text: str
-) -> None:
-    folder = _write(tmp_path / "m", tiny, **changes)
-    with pytest.raises(CalibrationError, match=rf"sensor\.yaml.*{text}"):
-        EurocSource(folder)
-
-
 def test_a_missing_sensor_says_the_way_out(tmp_path: Path, tiny: Any) -> None:
     folder = _write(tmp_path / "m", tiny)
     (folder / "mav0/cam1/sensor.yaml").unlink()
     said = r"cam1/sensor\.yaml: does not exist; add it or give --calibration FILE"
     with pytest.raises(CalibrationError, match=said):
-        EurocSource(folder)
-
-
-def test_a_date_that_is_none_is_refused_in_the_sensor_too(tmp_path: Path, tiny: Any) -> None:
-    folder = _write(tmp_path / "m", tiny)
-    with (folder / "mav0/cam1/sensor.yaml").open("a") as file:
-        file.write("calibrated: 2024-99-99\n")
-    with pytest.raises(CalibrationError, match=r"cam1/sensor\.yaml: the calibration is no YAML"):
         EurocSource(folder)
 
 
@@ -108,24 +81,6 @@ def test_a_missing_table_is_refused_and_a_missing_image_is_not(tmp_path: Path, t
     (folder / "mav0/cam1/data.csv").unlink()
     with pytest.raises(RecordingError, match=r"data\.csv: cannot be read: No such file"):
         EurocSource(folder)
-
-
-def test_a_calibration_file_replaces_the_rectification(tmp_path: Path, tiny: Any) -> None:
-    P = [50.0, 0, 23.5, -50.0, 0, 50.0, 15.5, 0, 0, 0, 1, 0]
-    pair = {"left": tiny.ros_camera(), "right": tiny.ros_camera(projection_matrix={"data": P})}
-    path = tmp_path / "pair.yaml"
-    path.write_text(yaml.safe_dump(pair))
-    info = EurocSource(_write(tmp_path / "m", tiny), calibration=path).info
-    assert getattr(info.camera, "baseline", None) == 1.0
-    assert not info.calibrations[0].is_rectified
-
-
-def test_a_fisheye_pair_is_rectified(tmp_path: Path, tiny: Any) -> None:
-    changes = {"distortion_model": "equidistant", "distortion_coefficients": [0.01, 0.0, 0.0, 0.0]}
-    source = EurocSource(_write(tmp_path / "m", tiny, **changes))
-    assert [c.model for c in source.info.calibrations] == ["equidistant"] * 2
-    assert getattr(source.info.camera, "baseline", 0) == pytest.approx(0.5)
-    assert all(isinstance(frame, StereoFrame) for frame in frames(source, Config()))
 
 
 def test_the_pose_on_the_body_is_that_of_the_rectified_camera(tmp_path: Path, tiny: Any) -> None:

@@ -15,7 +15,7 @@ from gvo.io.poses.base_frame import BaseFrame, parse_initial_pose
 from gvo.io.poses.tf import TfBuffer
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Edge, Estimate, FloatArray
-from tests.io.pose_bags import add_transform
+from tests.make.bags import add_transform
 from tests.results import estimate_at
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)

@@ -25,7 +25,7 @@ from gvo.io.poses.ground_truth import (
 )
 from gvo.io.poses.tf import read_tf
 from gvo.types import Failure, FloatArray
-from tests.io.pose_bags import FIX, ODOMETRY, STAMPED, TRANSFORM, WITH_COVARIANCE, PoseBag
+from tests.make.bags import FIX, ODOMETRY, STAMPED, TRANSFORM, WITH_COVARIANCE, PoseBag
 
 SECOND = 10**9
 

@@ -11,8 +11,8 @@ from gvo.io.poses.inputs import is_in_bag, read_compared, read_pose_input
 from gvo.trajectory.evaluation import Evaluation, evaluate
 from gvo.trajectory.formats import write_tum
 from gvo.trajectory.trajectory import Trajectory
-from tests.io import camera_bags
-from tests.io.pose_bags import ODOMETRY, STAMPED, PoseBag
+from tests.make import bags as camera_bags
+from tests.make.bags import ODOMETRY, STAMPED, PoseBag
 
 T_BASE_CAM = se3.exp(np.array([0.4, -0.8, 1.0, 0.3, 0.1, 0.5]))
 RUN_NAMES = ("raw", "causal", "smoothed", "global", "odom")

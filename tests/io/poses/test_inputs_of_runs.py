@@ -23,7 +23,7 @@ from gvo.io.recording import Source
 from gvo.trajectory.formats import write_tum
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure
-from tests.io.pose_bags import ODOMETRY, TRANSFORM, PoseBag
+from tests.make.bags import ODOMETRY, TRANSFORM, PoseBag
 from tests.rendered_walk import (
     CAMERA,
     STAMPS_NS,

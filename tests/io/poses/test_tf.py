@@ -18,7 +18,7 @@ from gvo.io.bag.reader import TF_TYPE, BagReader, typestore
 from gvo.io.poses import tf
 from gvo.io.poses.tf import TfBuffer, read_tf
 from gvo.types import Failure, FloatArray
-from tests.io.pose_bags import add_transform
+from tests.make.bags import add_transform
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
 FIRST_NS, LAST_NS = 1_700_000_000_000_000_000, 1_700_000_001_000_000_000

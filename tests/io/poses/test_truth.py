@@ -15,7 +15,7 @@ from gvo.io.poses.truth import Truth, find_truth, in_frame
 from gvo.trajectory.evaluation import evaluate
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FloatArray
-from tests.io.pose_bags import ODOMETRY, PoseBag, add_transform
+from tests.make.bags import ODOMETRY, PoseBag, add_transform
 
 SECOND = 10**9
 T_BASE_CAM = se3.exp(np.array([-1.2, 1.1, -1.3, 0.3, 0.1, 0.5]))

@@ -17,7 +17,7 @@ from gvo.io.poses.inputs import find_base_frame, read_truth
 from gvo.io.poses.truth import Truth, TruthComparison
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
-from tests.io.pose_bags import ODOMETRY, STAMPED, TRANSFORM, WITH_COVARIANCE, PoseBag
+from tests.make.bags import ODOMETRY, STAMPED, TRANSFORM, WITH_COVARIANCE, PoseBag
 from tests.rendered_walk import (
     STAMPS_NS,
     T_BASE_CAM,

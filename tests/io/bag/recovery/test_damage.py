@@ -114,8 +114,8 @@ def test_of_a_bag_cut_at_a_record_the_start_is_read(bags: dict[str, Path], name:
     data = bags[name].read_bytes()
     walk = _records_of_ros1 if name.endswith(".bag") else _records_of_mcap
     for position in walk(data):
-        for n_bytes in range(max(position - 2, 0), min(position + 12, len(data))):
-            _check_cut(bags[name], n_bytes)
+        for n_bytes in (position - 1, position, position + 5):
+            _check_cut(bags[name], min(n_bytes, len(data) - 1))
 
 
 def _check_cut(path: Path, n_bytes: int) -> None:
@@ -300,7 +300,7 @@ def _fill_page(data: bytes, start: int) -> bytes:
     return data[:start] + b"\xff" * 4096 + data[start + 4096 :]
 
 
-_HUGE = [2**31, 2**32 - 1, 2**63, 2**64 - 1]
+_HUGE = [2**32 - 1, 2**64 - 1]
 
 
 @pytest.mark.parametrize("size", _HUGE)
@@ -311,13 +311,13 @@ def test_a_claimed_size_is_not_allocated_in_mcap(tmp_path: Path, op: int, size: 
     path.write_bytes(good + struct.pack("<BQ", op, size) + bytes(200))
     _check_memory(path)
     # a string, a list, the data of a chunk, all longer than their record
-    for n_bytes in range(0, 60, 4):
+    for n_bytes in range(0, 60, 12):
         content = bytes(n_bytes) + struct.pack("<Q", size) + b"\xff" * 100
         path.write_bytes(good + struct.pack("<BQ", op, len(content)) + content)
         _check_memory(path)
 
 
-@pytest.mark.parametrize("size", _HUGE[:2])
+@pytest.mark.parametrize("size", [2**31, 2**32 - 1])
 @pytest.mark.parametrize("op", range(2, 8))
 @pytest.mark.parametrize("compression", [b"none", b"bz2", b"lz4"])
 def test_a_claimed_size_is_not_allocated_in_ros1(
