@@ -2,14 +2,12 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gvo.geometry.camera import PinholeCamera, StereoCamera
-from gvo.io.images import encode_image
 from gvo.types import FaultyFrame, FrameResult, RelativePose, RgbdFrame, Status, StereoFrame
 from gvo.viz.overlay import (
     FOOTER_PX,
@@ -101,14 +99,6 @@ def test_a_coloured_image_and_unequal_counts_are_refused() -> None:
         draw_matches(_plain(), pixels, pixels, inliers)
     with pytest.raises(ValueError, match="grey image and 2 matches"):
         draw_matches(_GREY, pixels, pixels[:1], inliers)
-
-
-def test_a_jpeg_shows_the_picture() -> None:
-    smooth = cv2.GaussianBlur(_draw([((20.0, 30.0), (60.0, 35.0), True)]), (0, 0), 3)
-    data = encode_image(np.asarray(smooth, dtype=np.uint8), ".jpg")
-    decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    assert decoded is not None
-    np.testing.assert_allclose(decoded.astype(float), smooth.astype(float), atol=12)
 
 
 _STEREO = StereoCamera(fx=600, fy=600, cx=320, cy=120, width=640, height=240, baseline=0.5)

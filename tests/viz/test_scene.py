@@ -73,6 +73,10 @@ def test_a_scene_names_what_is_drawn() -> None:
     assert seen.stage_ms == {"extract": 4.0, "window": 1.5}
     assert seen.chi2 == {"step": 6.0}
     assert seen.poses["causal"] is result.causal
+    first = result_of(3)  # as where a run is joined: its links lead to frames that are not known
+    alone = History()
+    alone.add(first)
+    assert scene(first, alone).lines == {}
     assert seen.caption[0].startswith("ok: 95 of 105 matches are inliers")
     assert "loop to 0.4 s before" in seen.caption[1]
 

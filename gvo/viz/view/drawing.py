@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
+import trimesh
 import viser
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gvo.geometry.camera import PinholeCamera
-from gvo.types import FloatArray, ImageArray, IntArray
+from gvo.types import FloatArray, ImageArray
 from gvo.viz.palette import DRAWN, rgb
 from gvo.viz.scene import Ellipsoids, Scene, ellipsoids
 from gvo.viz.view.clouds import Cloud
@@ -38,60 +41,23 @@ _JPEG_QUALITY = 80
 _POINT_SHARE, _CLOUD_SHARE, _KEYFRAME_SHARE = 0.035, 0.025, 0.35
 
 
-class _Lines:
-    """Lines of one colour."""
+class _Node:
+    """A node that is there while it has something to draw: browsers complain of empty ones."""
 
-    def __init__(
-        self, scene: viser.SceneApi, node: str, colour: str, *, thickness_px: float = 2.0
-    ) -> None:
-        self._scene, self._node = scene, node
-        self._colour, self._thickness_px = rgb(colour), thickness_px
+    def __init__(self, add: Callable[..., Any], *names: str) -> None:
+        self._add, self._names = add, names
         self._handle: Any = None
 
-    def show(self, lines: FloatArray) -> None:
-        """Draw lines of shape (n, 2, 3), metres."""
-        if len(lines) == 0:
-            if self._handle is not None:
-                self._handle.remove()
-                self._handle = None
+    def show(self, *arrays: NDArray[Any]) -> None:
+        """Draw the arrays of those names."""
+        if self._handle is None and len(arrays[0]) > 0:
+            self._handle = self._add(*arrays)
+        elif self._handle is not None and len(arrays[0]) == 0:
+            self._handle.remove()
+            self._handle = None
         elif self._handle is not None:
-            self._handle.points = lines.astype(np.float32)
-        else:
-            self._handle = self._scene.add_line_segments(
-                self._node,
-                lines.astype(np.float32),
-                self._colour,
-                thickness=self._thickness_px,
-                thickness_units="screen",
-            )
-
-
-class _Points:
-    """Round points; none at all where there are none, of which browsers complain."""
-
-    def __init__(self, scene: viser.SceneApi, node: str) -> None:
-        self._scene, self._node = scene, node
-        self._handle: Any = None
-
-    def show(self, cloud: Cloud, size_m: float) -> None:
-        """Draw points."""
-        points, colours = cloud
-        if len(points) == 0:
-            if self._handle is not None:
-                self._handle.remove()
-                self._handle = None
-        elif self._handle is not None:
-            self._handle.points, self._handle.colors = points, colours
-        else:
-            self._handle = self._scene.add_point_cloud(
-                self._node,
-                points,
-                colours,
-                point_size=size_m,
-                point_shape="circle",
-                point_shading="flat",
-                precision="float32",
-            )
+            for name, array in zip(self._names, arrays, strict=True):
+                setattr(self._handle, name, array)
 
 
 class Drawing:
@@ -106,20 +72,46 @@ class Drawing:
             layer: scene.add_frame(node, show_axes=False) for layer, node in _NODES.items()
         }
         self._paths = {
-            name: _Lines(scene, f"{_NODES[name]}/line", DRAWN[name], thickness_px=3.0)
-            for name in _PATHS
+            name: self._lines(f"{_NODES[name]}/line", DRAWN[name], 3.0) for name in _PATHS
         }
         self._links = {
-            name: _Lines(scene, f"/links/{name.replace(' ', '_')}", DRAWN[name]) for name in _LINKS
+            name: self._lines(f"/links/{name.replace(' ', '_')}", DRAWN[name]) for name in _LINKS
         }
-        self._loops = _Lines(scene, "/loops/loops", DRAWN["loops"])
-        self._keyframes = _Lines(scene, "/keyframes/cameras", DRAWN["keyframes"])
-        self._points = _Points(scene, "/camera/points/cloud")
-        self._cloud = _Points(scene, "/cloud/points")
+        self._loops = self._lines("/loops/loops", DRAWN["loops"])
+        self._keyframes = self._lines("/keyframes/cameras", DRAWN["keyframes"])
+        self._points = self._cloud_node("/camera/points/cloud", _POINT_SHARE)
+        self._cloud = self._cloud_node("/cloud/points", _CLOUD_SHARE)
         self._ellipsoids: Any = None
         self._frustum: Any = None
         self._size = 1.0
         self._aspect, self._fov = 4 / 3, 1.0
+
+    def _lines(self, node: str, colour: str, thickness_px: float = 2.0) -> _Node:
+        """Return a node of lines (n, 2, 3) of one colour."""
+        add = partial(
+            self._scene.add_line_segments,
+            node,
+            colors=rgb(colour),
+            thickness=thickness_px,
+            thickness_units="screen",
+        )
+        return _Node(add, "points")
+
+    def _cloud_node(self, node: str, size_share: float) -> _Node:
+        """Return a node of round points (n, 3) and their colours."""
+
+        def add(points: NDArray[Any], colours: NDArray[Any]) -> Any:  # noqa: ANN401 - a handle
+            return self._scene.add_point_cloud(
+                node,
+                points,
+                colours,
+                point_size=size_share * self._size,
+                point_shape="circle",
+                point_shading="flat",
+                precision="float32",
+            )
+
+        return _Node(add, "points", "colors")
 
     def set_camera(self, camera: PinholeCamera, size_m: float) -> None:
         """Set the shape of the camera; its image is drawn at a distance of `size_m`, metres."""
@@ -164,7 +156,7 @@ class Drawing:
         lines = np.stack([positions[:-1], positions[1:]], axis=1)
         if name == "truth" and len(lines) > 2:
             lines = lines[np.arange(len(lines)) % 3 != 2]
-        self._paths[name].show(lines)
+        self._paths[name].show(lines.astype(np.float32))
 
     def show_camera(self, T_world_frame: FloatArray, image: ImageArray) -> None:
         """Move the camera with what hangs on it, and show an RGB image (h, w, 3) in it."""
@@ -175,24 +167,24 @@ class Drawing:
 
     def show_points(self, cloud_cam: Cloud) -> None:
         """Draw the points of the current frame, in the camera frame."""
-        self._points.show(cloud_cam, _POINT_SHARE * self._size)
+        self._points.show(*cloud_cam)
 
     def show_cloud(self, cloud_world: Cloud) -> None:
         """Draw the points of all keyframes, in the world."""
-        self._cloud.show(cloud_world, _CLOUD_SHARE * self._size)
+        self._cloud.show(*cloud_world)
 
     def show_loops(self, lines: FloatArray) -> None:
         """Draw the loops so far, lines of shape (n, 2, 3), metres."""
-        self._loops.show(lines)
+        self._loops.show(lines.astype(np.float32))
 
     def show_scene(self, scene: Scene, n_sigmas: float) -> None:
         """Draw keyframes as small cameras, links, and ellipsoids of the window's poses."""
         corners = _frustum_edges(self._fov, self._aspect, _KEYFRAME_SHARE * self._size)
         poses = np.array([each.T_world_frame for each in scene.keyframes]).reshape(-1, 4, 4)
         edges = np.einsum("nij,ekj->neki", poses[:, :3, :3], corners) + poses[:, None, None, :3, 3]
-        self._keyframes.show(edges.reshape(-1, 2, 3))
+        self._keyframes.show(edges.reshape(-1, 2, 3).astype(np.float32))
         for name, lines in self._links.items():
-            lines.show(scene.lines.get(name, _NO_LINES))
+            lines.show(scene.lines.get(name, _NO_LINES).astype(np.float32))
         self._show_ellipsoids(ellipsoids(scene.window, n_sigmas))
 
     def _show_ellipsoids(self, found: Ellipsoids) -> None:
@@ -201,11 +193,11 @@ class Drawing:
             self._ellipsoids = None
         if len(found.centres) == 0:
             return
-        vertices, faces = _unit_sphere()
+        sphere = trimesh.creation.icosphere(subdivisions=3)
         self._ellipsoids = self._scene.add_batched_meshes_simple(
             "/ellipsoids/meshes",
-            vertices,
-            faces,
+            np.asarray(sphere.vertices),
+            np.asarray(sphere.faces),
             np.roll(found.quaternions_xyzw, 1, axis=1),
             found.centres,
             batched_scales=np.maximum(found.half_axes, 1e-6).astype(np.float32),
@@ -229,19 +221,3 @@ def _frustum_edges(fov: float, aspect: float, depth: float) -> FloatArray:
     rays = np.stack([np.zeros_like(far), far], axis=1)
     rim = np.stack([far, np.roll(far, -1, axis=0)], axis=1)
     return np.concatenate([rays, rim])
-
-
-def _unit_sphere(n_rings: int = 10) -> tuple[NDArray[np.float64], IntArray]:
-    """Return the corners (v, 3) and triangles (f, 3) of a sphere of radius 1."""
-    n_around = 2 * n_rings
-    polar = np.linspace(0.0, np.pi, n_rings + 1)
-    around = np.linspace(0.0, 2.0 * np.pi, n_around, endpoint=False)
-    z = np.repeat(np.cos(polar), n_around)
-    x = np.outer(np.sin(polar), np.cos(around)).ravel()
-    y = np.outer(np.sin(polar), np.sin(around)).ravel()
-    ring, step = np.divmod(np.arange(n_rings * n_around), n_around)
-    a = ring * n_around + step
-    b = ring * n_around + (step + 1) % n_around
-    lower = np.stack([a, a + n_around, b], axis=1)
-    upper = np.stack([b, a + n_around, b + n_around], axis=1)
-    return np.stack([x, y, z], axis=1), np.concatenate([lower, upper])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import ipaddress
 import socket
@@ -130,30 +131,22 @@ def _refusing_strangers(*, is_local: bool) -> Iterator[None]:
 
 def find_port(host: str, port: int) -> int:
     """Return the first free port from the given one; 0 stands for any."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     last = min(port + N_PORTS, 65536)
     for candidate in range(port, last):
-        problem = _try_port(host, candidate)
-        if problem is None:
+        try:
+            socket.create_server((host, candidate), family=family).close()
+        except OSError as error:
+            if error.errno not in (errno.EADDRINUSE, errno.EACCES):
+                raise ConfigurationError(
+                    f"--host {host}: no address of this machine; 127.0.0.1 is only for this "
+                    "machine, 0.0.0.0 for everyone on the network"
+                ) from error
+        else:
             return candidate
-        if isinstance(problem, socket.gaierror) or "assign" in str(problem):
-            raise ConfigurationError(
-                f"--host {host}: no address of this machine ({problem.strerror}); "
-                "127.0.0.1 is only for this machine, 0.0.0.0 for everyone on the network"
-            )
     raise ConfigurationError(
         f"no free port from {port} to {last - 1} on {host}; give another one, --port 0 for any"
     )
-
-
-def _try_port(host: str, port: int) -> OSError | None:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family, socket.SOCK_STREAM) as trial:
-        trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            trial.bind((host, port))
-        except OSError as error:
-            return error
-    return None
 
 
 def _silence() -> contextlib.AbstractContextManager[object]:

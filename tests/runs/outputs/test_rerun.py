@@ -14,8 +14,6 @@ import cv2
 import numpy as np
 import pyarrow as pa  # type: ignore[import-untyped]
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 if os.environ.get("CI") != "true":
@@ -23,11 +21,10 @@ if os.environ.get("CI") != "true":
 import rerun as rr
 from rerun.chunk import RrdReader
 
-import gvo.viz.scene as drawn
 from gvo.config import Config
 from gvo.errors import GvoError, RecordingError
 from gvo.geometry.camera import StereoCamera
-from gvo.geometry.se3 import exp, make_transform
+from gvo.geometry.se3 import make_transform
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.run_folder.writer import RunFolder
 from gvo.io.synthetic import SyntheticRecording
@@ -42,7 +39,6 @@ from gvo.types import (
     FloatArray,
     FrameLink,
     FrameResult,
-    RelativePose,
     StereoFrame,
 )
 from gvo.viz.palette import COUNTS, LINKS, STAGES
@@ -304,11 +300,6 @@ def test_matched_points_project_to_where_they_were_seen(any_run: _Run) -> None:
         assert len(colours) == len(set(result.registration.inliers.tolist()))
 
 
-def test_the_camera_hangs_below_the_frame_as_it_is_mounted(any_run: _Run) -> None:
-    mount = _matrix(any_run.read.fixed[_CAMERA_ENTITY])
-    np.testing.assert_allclose(mount, any_run.frames.mount(0), atol=1e-6)
-
-
 def test_the_cloud_has_the_inliers_of_each_keyframe_in_the_world(any_run: _Run) -> None:
     causal = any_run.causal()
     clouds = {row.stamp_ns: row.values for row in any_run.read.rows["/world/cloud"]}
@@ -380,32 +371,6 @@ def test_a_placed_camera_tells_where_up_is(tmp_path: Path, down: str, axes: list
     assert read.fixed["/world"]["ViewCoordinates:xyz"][0] == axes
 
 
-@settings(max_examples=30)
-@given(
-    numbers=st.lists(st.floats(-1.0, 1.0), min_size=36, max_size=36),
-    twist=st.lists(st.floats(-2.0, 2.0), min_size=6, max_size=6),
-)
-def test_any_covariance_gives_its_ellipsoid(numbers: list[float], twist: list[float]) -> None:
-    from gvo.runs.outputs.rerun import _ellipsoids as make_ellipsoids
-
-    A = np.array(numbers).reshape(6, 6)
-    estimate = Estimate(stamp_ns=0, T_world_frame=exp(np.array(twist)), covariance=A @ A.T)
-    batches = make_ellipsoids("raw", [estimate]).as_component_batches()
-    values = {b.component_descriptor().component: b.as_arrow_array().to_pylist() for b in batches}
-    _check_ellipsoid(values, 0, estimate)
-
-
-def test_a_covariance_that_is_not_finite_has_no_ellipsoid(tmp_path: Path) -> None:
-    result = _made(0)
-    unknown = replace(result.raw, covariance=np.full((6, 6), np.inf))
-    read = _write_made(tmp_path, [replace(result, raw=unknown)])
-    sizes = {
-        name: len(read.latest(f"/world/{name}/covariance", 0)["Ellipsoids3D:half_sizes"])
-        for name in ("raw", "causal")
-    }
-    assert sizes == {"raw": 0, "causal": 1}
-
-
 def _made(
     stamp_ns: int, T_world_cam: FloatArray | None = None, *, links: tuple[FrameLink, ...] = ()
 ) -> FrameResult:
@@ -446,17 +411,6 @@ def test_a_camera_that_moves_in_the_frame_is_placed_at_each_stamp(tmp_path: Path
     }
 
 
-def test_a_pose_that_cannot_be_tied_to_a_known_frame_has_no_link(tmp_path: Path) -> None:
-    def link(reference_ns: int, *, is_accepted: bool) -> FrameLink:
-        return FrameLink(reference_ns=reference_ns, kind="step", chi2=1.0, is_accepted=is_accepted)
-
-    links = (link(10, is_accepted=True), link(11, is_accepted=True), link(10, is_accepted=False))
-    read = _write_made(tmp_path, [_made(10), _made(20, links=links)])
-    drawn = read.latest("/world/links", 1)
-    assert len(drawn["LineStrips3D:strips"]) == 2
-    assert len(set(drawn["LineStrips3D:colors"])) == 2  # refused ones stand out
-
-
 def test_loops_run_between_causal_poses_and_at_the_end_between_global_ones(tmp_path: Path) -> None:
     def at(x: float) -> FloatArray:
         return make_transform(np.eye(3), np.array([x, 0.0, 0.0]))
@@ -480,23 +434,6 @@ def test_loops_run_between_causal_poses_and_at_the_end_between_global_ones(tmp_p
     assert [point[0] for point in _strip(read.latest("/world/global/path", 2))] == [0.0, 0.5, 1.0]
 
 
-def test_points_that_are_not_finite_are_left_out(tmp_path: Path) -> None:
-    points = np.array([[1.0, 2.0, 3.0], [np.nan, 0.0, 1.0], [0.0, 0.0, np.inf], [4.0, 5.0, 6.0]])
-    found = RelativePose(
-        T_reference_current=np.eye(4),
-        covariance=np.eye(6),
-        matches=np.zeros((4, 2), dtype=np.int64),
-        inliers=np.array([True, True, True, False]),
-        pixels_reference=np.full((4, 2), 7.0),
-        pixels_current=np.full((4, 2), 9.0),
-        points_current=points,
-    )
-    read = _write_made(tmp_path, [replace(_made(3), registration=found, keyframes_ns=(3,))])
-    drawn = read.latest(f"{_CAMERA_ENTITY}/points", 0)["Points3D:positions"]
-    np.testing.assert_allclose(drawn, points[[0, 3]])
-    np.testing.assert_allclose(read.latest("/world/cloud", 0)["Points3D:positions"], points[:1])
-
-
 def test_faulty_frames_are_told_and_counted(tmp_path: Path) -> None:
     path = tmp_path / "made.rrd"
     with RunRerun(path, _CAMERA) as file:
@@ -513,27 +450,6 @@ def test_faulty_frames_are_told_and_counted(tmp_path: Path) -> None:
     assert [row[2] for row in rows][::2] == ["skipped: black", "skipped: torn"]
     assert [row.frame for row in read.rows["/world/causal/frame"]] == [1, 3]
     assert [(r.frame, r.stamp_ns) for r in read.rows["/world/smoothed/frame"]] == [(1, 2)]
-
-
-def test_path_and_recent_poses_are_all_there_were_at_each_frame(tmp_path: Path) -> None:
-    places = np.cumsum(np.random.default_rng(0).normal(size=(14, 3)), axis=0)
-    poses = [make_transform(np.eye(3), place) for place in places]
-    read = _write_made(tmp_path, [_made(k * 300_000_000, T) for k, T in enumerate(poses)])
-    for frame in range(1, 13):
-        drawn = _strip(read.latest("/world/raw/recent", frame))
-        if frame >= 4:  # after the first second
-            drawn = _strip(read.latest("/world/raw/path", frame)) + drawn[1:]
-        np.testing.assert_allclose(drawn, places[: frame + 1], atol=2e-6)
-
-
-def test_paths_on_the_way_are_thinned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drawn, "N_SHOWN_POSES", 10)
-    places = [make_transform(np.eye(3), np.array([float(k), 0.0, 0.0])) for k in range(60)]
-    results = [_made(k * _SECOND_NS, T) for k, T in enumerate(places)]
-    rows = _write_made(tmp_path, results).rows["/world/causal/path"]
-    assert max(len(_strip(row.values)) for row in rows[:-1]) <= 11
-    assert [_strip(row.values)[-1][0] for row in rows[:-1]] == list(range(1, 60))
-    assert len(_strip(rows[-1].values)) == 60
 
 
 def test_each_frame_may_come_from_another_thread(tmp_path: Path) -> None:
