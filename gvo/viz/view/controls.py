@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -63,7 +64,8 @@ class ParameterControls:
         self.config, self._apply, self._say = config, apply, say
         self._refusal = ""
         self._lock = threading.RLock()
-        self._timer: threading.Timer | None = None
+        self._due_s = math.inf  # when what is shown is applied, by the clock of `monotonic`
+        self._is_typing = False
         self._is_closed = False
         self._controls: dict[tuple[str, str], _Control] = {}
         values = config.model_dump()
@@ -87,7 +89,15 @@ class ParameterControls:
 
     def flush(self) -> None:
         """Apply what the controls show; where it is refused, say why and show what is valid."""
-        self._apply_values(is_typing=False)
+        with self._lock:
+            self._is_typing = False
+            self._apply_values()
+
+    def tick(self) -> None:
+        """Apply what was changed a while ago; called again and again."""
+        with self._lock:
+            if time.monotonic() >= self._due_s:
+                self._apply_values()
 
     def follow(self, config: Config) -> None:
         """Show what was changed elsewhere, and leave the fields of all else."""
@@ -99,34 +109,31 @@ class ParameterControls:
                 if is_changed and not self._is_closed:
                     control.show(value)
 
-    def _apply_values(self, *, is_typing: bool) -> None:
-        """Apply values; skip a field being edited."""
-        with self._lock:
-            self._stop_timer()
-            values = self.config.model_dump()
-            for (section, key), control in self._controls.items():
-                values[section][key] = _kept(values[section][key], control.value)
-            if values == self.config.model_dump():
-                self._tell("")
+    def _apply_values(self) -> None:
+        self._due_s = math.inf
+        values = self.config.model_dump()
+        for (section, key), control in self._controls.items():
+            values[section][key] = _kept(values[section][key], control.value)
+        if values == self.config.model_dump():
+            self._tell("")
+            return
+        try:
+            config = validate_configuration(values)
+            self._apply(config)
+        except ConfigurationError as error:
+            self._tell(str(error))
+            if self._is_typing:
+                self._wait(PATIENCE_S, is_typing=False)
                 return
-            try:
-                config = validate_configuration(values)
-                self._apply(config)
-            except ConfigurationError as error:
-                self._tell(str(error))
-                if is_typing:
-                    self._start_timer(PATIENCE_S, is_typing=False)
-                    return
-            else:
-                self.config = config
-                self._tell("")
-            self._show()
+        else:
+            self.config = config
+            self._tell("")
+        self._show()
 
     def close(self) -> None:
         """Drop changes that were not applied yet."""
         with self._lock:
             self._is_closed = True
-            self._stop_timer()
 
     def _tell(self, refusal: str) -> None:
         if refusal != self._refusal:
@@ -142,20 +149,10 @@ class ParameterControls:
         if event.client_id is None:  # the program's own change
             return
         with self._lock:
-            self._stop_timer()
-            if self._is_closed:
-                return
-            self._start_timer(DELAY_S, is_typing=True)
+            self._wait(DELAY_S, is_typing=True)
 
-    def _start_timer(self, delay_s: float, *, is_typing: bool) -> None:
-        self._timer = threading.Timer(delay_s, self._apply_values, kwargs={"is_typing": is_typing})
-        self._timer.daemon = True
-        self._timer.start()
-
-    def _stop_timer(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
+    def _wait(self, delay_s: float, *, is_typing: bool) -> None:
+        self._due_s, self._is_typing = time.monotonic() + delay_s, is_typing
 
 
 def _kept(old: Value, new: Value) -> Value:

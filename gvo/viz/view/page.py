@@ -15,10 +15,10 @@ from gvo.config import describe_configuration
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
-from gvo.trajectory.alignment import alignment, associate
+from gvo.trajectory.alignment import alignment, pair
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import FloatArray, ImageArray, IntArray
-from gvo.viz.scene import GLOBAL
+from gvo.types import FloatArray, ImageArray
+from gvo.viz.scene import GLOBAL, Path
 from gvo.viz.view import panels
 from gvo.viz.view.controls import ParameterControls
 from gvo.viz.view.drawing import Drawing
@@ -39,7 +39,6 @@ _DEPTH_PER_BASELINE = 30.0
 _VIEW_SHARE = 0.5
 _PERIOD_S = 1.0 / 15.0  # at least, from drawing to drawing
 _CLOUD_PERIOD_S = 1.0  # it is large
-_NOTHING = np.zeros((0, 3))
 
 
 def serve_player(
@@ -62,7 +61,7 @@ class Page:
         self, server: viser.ViserServer, player: Player | LivePlayer, *, truth: Trajectory | None
     ) -> None:
         self._server, self._player = server, player
-        self._truth = None if truth is None else TruthPath(truth)
+        self._truth = truth if truth is not None and len(truth) > 0 else None
         self._absent = {"truth"} if truth is None else set()
         self._cloud_of: tuple[int, int] | None = None
         self._cloud_s = -math.inf  # when it was drawn
@@ -103,6 +102,7 @@ class Page:
             elif frame is not None:
                 self._draw_cloud(newest)
             self._show_state()
+            self.controls.tick()
             self._drawn = shown
 
     def _draw(self, frame: FrameView, newest: Newest) -> None:
@@ -188,8 +188,8 @@ class Page:
             if name != GLOBAL:  # it comes at the end of a run
                 self.drawing.show_path(name, poses[:, :3])
         if self._truth is not None and "causal" in frame.paths:
-            stamps_ns, poses = frame.paths["causal"]
-            self.drawing.show_path("truth", self._truth.until(stamps_ns, poses[:, :3]))
+            positions = truth_positions(self._truth, frame.paths["causal"])
+            self.drawing.show_path("truth", positions)
 
     def _draw_cloud(self, newest: Newest, *, every_s: float = 0.0) -> None:
         """Draw the points of the keyframes where there are others than before."""
@@ -222,45 +222,21 @@ def _rgb(image: ImageArray) -> ImageArray:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
 
 
-class TruthPath:
-    """Aligns the truth with a growing estimate.
+def truth_positions(truth: Trajectory, path: Path) -> FloatArray:
+    """Return the truth (m, 3) along a path that starts at the origin of its world, metres.
 
-    Where the truth has a rotation at the first frame, the first poses are aligned, so that drift
-    shows; else all positions are, by a rigid motion.
+    Where the truth has a rotation at the first frame it starts there too, so that drift shows;
+    else all positions are fitted by a rigid motion.
     """
-
-    def __init__(self, truth: Trajectory) -> None:
-        self._truth = truth
-        self._first_ns: int | None = None
-        self._moved: Trajectory | None = None
-
-    def until(self, stamps_ns: IntArray, positions_world: FloatArray) -> FloatArray:
-        """Return the positions (m, 3) between the first and last stamp of the estimate, metres."""
-        if len(stamps_ns) == 0:
-            return _NOTHING
-        if self._first_ns != int(stamps_ns[0]):
-            self._first_ns = int(stamps_ns[0])
-            self._moved = self._aligned_at_first(stamps_ns[:1])
-        moved = self._moved or self._fitted(stamps_ns, positions_world)
-        if moved is None:
-            return _NOTHING
-        is_in = (moved.stamps_ns >= stamps_ns[0]) & (moved.stamps_ns <= stamps_ns[-1])
-        return np.asarray(moved.positions[is_in])
-
-    def _aligned_at_first(self, first_ns: IntArray) -> Trajectory | None:
-        stamps_ns = self._truth.stamps_ns
-        if not self._truth.has_rotations or len(stamps_ns) == 0:
-            return None
-        if not stamps_ns[0] <= first_ns[0] <= stamps_ns[-1]:
-            return None
-        T_truth_first = self._truth.interpolate(first_ns).T_world_frame[0]
-        return self._truth.moved(se3.invert(T_truth_first))
-
-    def _fitted(self, stamps_ns: IntArray, positions_world: FloatArray) -> Trajectory | None:
-        estimate = Trajectory.of_positions(stamps_ns, positions_world)
+    stamps_ns, poses = path
+    if truth.has_rotations and truth.stamps_ns[0] <= stamps_ns[0] <= truth.stamps_ns[-1]:
+        T_truth_first = truth.interpolate(stamps_ns[:1]).T_world_frame[0]
+        moved = truth.moved(se3.invert(T_truth_first))
+    else:
         try:
-            rows_truth, rows = associate(self._truth, estimate)
+            true, paired = pair(truth, Trajectory.of_positions(stamps_ns, poses[:, :3]))
         except TrajectoryError:
-            return None
-        fit = alignment(estimate.select(rows), self._truth.select(rows_truth), "se3")
-        return fit.apply(self._truth)
+            return np.zeros((0, 3))
+        moved = alignment(paired, true, "se3").apply(truth)
+    is_in = (moved.stamps_ns >= stamps_ns[0]) & (moved.stamps_ns <= stamps_ns[-1])
+    return np.asarray(moved.positions[is_in])

@@ -1,6 +1,6 @@
 """The page of a recording shows what the player does, and controls it."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -15,10 +15,12 @@ from gvo.geometry import se3
 from gvo.io.synthetic import SyntheticRecording
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
+from gvo.viz.scene import Path, Track
 from gvo.viz.view import serve
-from gvo.viz.view.page import Page, TruthPath
+from gvo.viz.view.page import Page, truth_positions
 from gvo.viz.view.player import Player
 from gvo.viz.view.server import ViewServer
+from tests.results import estimate_at
 from tests.viz.view.fakes import (
     PERIOD_NS,
     FakePlayer,
@@ -197,60 +199,42 @@ def truth_at(T: FloatArray, stamps_ns: IntArray = STAMPS_NS) -> Trajectory:
     return Trajectory(stamps_ns=stamps_ns, T_world_frame=T @ spiral())
 
 
-def drawn(path: TruthPath, rows: Sequence[int] | slice = slice(None)) -> FloatArray:
-    return path.until(STAMPS_NS[rows], spiral()[rows][:, :3, 3])
+def path_of(n: int = N, scale: float = 1.0) -> Path:
+    track = Track()
+    for stamp_ns, T in zip(STAMPS_NS[:n].tolist(), spiral(), strict=False):
+        track.add(estimate_at(stamp_ns, se3.make_transform(T[:3, :3], scale * T[:3, 3])))
+    return track.path()
 
 
-@given(TWISTS)
+@given(TWISTS, st.booleans())
 @settings(max_examples=20)
-def test_the_pose_of_the_first_frame_lays_the_truth(twist: FloatArray) -> None:
-    path = TruthPath(truth_at(se3.exp(twist)))
-    np.testing.assert_allclose(drawn(path), spiral()[:, :3, 3], atol=1e-9)
-
-
-@given(TWISTS)
-@settings(max_examples=20)
-def test_positions_alone_are_fitted(twist: FloatArray) -> None:
-    moved = truth_at(se3.exp(twist))
-    path = TruthPath(Trajectory.of_positions(moved.stamps_ns, moved.positions))
-    np.testing.assert_allclose(drawn(path), spiral()[:, :3, 3], atol=1e-6)
+def test_the_truth_is_laid_onto_the_estimate(twist: FloatArray, has_rotations: bool) -> None:
+    truth = truth_at(se3.exp(twist))
+    if not has_rotations:
+        truth = Trajectory.of_positions(truth.stamps_ns, truth.positions)
+    positions = truth_positions(truth, path_of())
+    np.testing.assert_allclose(positions, spiral()[:, :3, 3], atol=1e-6)
 
 
 def test_a_drift_shows_where_the_first_pose_is_known_and_is_shared_out_where_not() -> None:
-    estimate = spiral()[:, :3, 3] * 1.2
-    truth = truth_at(np.eye(4))
-    laid = TruthPath(truth).until(STAMPS_NS, estimate)
-    fitted = TruthPath(Trajectory.of_positions(STAMPS_NS, truth.positions)).until(
-        STAMPS_NS, estimate
-    )
-    errors = [np.linalg.norm(estimate - positions, axis=1) for positions in (laid, fitted)]
+    truth, path = truth_at(np.eye(4)), path_of(scale=1.2)
+    bare = Trajectory.of_positions(STAMPS_NS, truth.positions)
+    laid, fitted = truth_positions(truth, path), truth_positions(bare, path)
+    errors = [np.linalg.norm(path[1][:, :3] - found, axis=1) for found in (laid, fitted)]
     assert errors[0][0] < 1e-9
     assert errors[0][-1] > errors[1][-1]
     assert errors[1][0] > 1e-3
 
 
 @pytest.mark.parametrize("n", [1, 5, N])
-def test_it_is_drawn_as_far_as_the_estimate_has_come(n: int) -> None:
-    path = TruthPath(truth_at(np.eye(4)))
-    np.testing.assert_allclose(drawn(path, slice(0, n)), spiral()[:n, :3, 3], atol=1e-9)
+def test_the_truth_is_drawn_as_far_as_the_estimate_has_come(n: int) -> None:
+    found = truth_positions(truth_at(np.eye(4)), path_of(n))
+    np.testing.assert_allclose(found, spiral()[:n, :3, 3], atol=1e-9)
 
 
-def test_another_first_frame_is_another_world() -> None:
-    path = TruthPath(truth_at(np.eye(4)))
-    assert len(drawn(path)) == N
-    later = path.until(STAMPS_NS[3:], spiral()[3:, :3, 3])
-    expected = (se3.invert(spiral()[3]) @ spiral()[3:])[:, :3, 3]
-    np.testing.assert_allclose(later, expected, atol=1e-9)
-
-
-def test_a_truth_that_begins_later_is_fitted() -> None:
+def test_a_truth_that_begins_later_is_fitted_and_one_elsewhere_not_drawn() -> None:
     T = se3.exp(np.array([0.1, -0.4, 0.2, 3.0, 1.0, -2.0]))
-    truth = truth_at(T).select(slice(4, None))
-    np.testing.assert_allclose(drawn(TruthPath(truth)), spiral()[4:, :3, 3], atol=1e-6)
-
-
-def test_nothing_is_drawn_where_nothing_is_known() -> None:
-    path = TruthPath(truth_at(np.eye(4)))
-    assert path.until(STAMPS_NS[:0], np.zeros((0, 3))).shape == (0, 3)
-    elsewhere = Trajectory.of_positions(STAMPS_NS + 10**15, spiral()[:, :3, 3])
-    assert drawn(TruthPath(elsewhere)).shape == (0, 3)
+    later = truth_at(T).select(slice(4, None))
+    np.testing.assert_allclose(truth_positions(later, path_of()), spiral()[4:, :3, 3], atol=1e-6)
+    elsewhere = truth_at(T, STAMPS_NS + 10**15)
+    assert truth_positions(elsewhere, path_of()).shape == (0, 3)
