@@ -113,11 +113,9 @@ def _require(is_kept: bool | np.bool_, message: str) -> None:
 def _check_capabilities(frontend: Frontend[Any]) -> None:
     """Check the values of what a front-end offers besides; else they are ignored without a word."""
     for name, kinds in (("camera", StereoCamera | PinholeCamera), ("rig_offsets", RigOffsets)):
-        value = getattr(frontend, name, None)
-        _require(
-            value is None or isinstance(value, kinds),
-            f"{name} is a {type(value).__name__}, which is none of {kinds}",
-        )
+        kind = type(getattr(frontend, name, None))
+        is_right = issubclass(kind, kinds | None)
+        _require(is_right, f"{name} is a {kind.__name__}, which is none of {kinds}")
     methods = {n: getattr(frontend, n, None) for n in ("reconfigure", "describe", "recognize")}
     for name, method in methods.items():
         _require(method is None or callable(method), f"{name} must be a method")
@@ -131,14 +129,10 @@ def _extract(frontend: Frontend[Any], frame: Stamped) -> Stamped:
     first: Stamped = frontend.extract(frame)
     _require(fingerprint(frame) == before, f"extract changes the frame at {frame.stamp_ns}")
     stamp_ns = getattr(first, "stamp_ns", None)
-    _require(
-        stamp_ns == frame.stamp_ns,
-        f"extract must keep the stamp {frame.stamp_ns}, its observations have {stamp_ns}",
-    )
-    _require(
-        fingerprint(first) == fingerprint(frontend.extract(frame)),
-        f"extract gives other observations of the frame at {frame.stamp_ns} when called again",
-    )
+    message = f"extract must keep the stamp {frame.stamp_ns}, its observations have {stamp_ns}"
+    _require(stamp_ns == frame.stamp_ns, message)
+    message = f"extract gives other observations of the frame at {frame.stamp_ns} when repeated"
+    _require(fingerprint(first) == fingerprint(frontend.extract(frame)), message)
     return first
 
 
@@ -150,16 +144,12 @@ def _register(
     given = reference, current, prior
     before = [fingerprint(value) for value in given]
     first, second = frontend.register(*given), frontend.register(*given)
-    for part, value, former in zip(("reference", "current", "prior"), given, before, strict=True):
-        _require(fingerprint(value) == former, f"{name} changes its argument {part}")
-    _require(
-        isinstance(first, RelativePose | Failure),
-        f"{name} must return RelativePose or Failure, got {type(first).__name__}",
-    )
-    _require(
-        fingerprint(first) == fingerprint(second),
-        f"{name} gives another result when called again with the same arguments",
-    )
+    for k, part in enumerate(("reference", "current", "prior")):
+        _require(fingerprint(given[k]) == before[k], f"{name} changes its argument {part}")
+    is_result, kind = isinstance(first, RelativePose | Failure), type(first).__name__
+    _require(is_result, f"{name} must return RelativePose or Failure, got {kind}")
+    is_same = fingerprint(first) == fingerprint(second)
+    _require(is_same, f"{name} gives another result when called again with the same arguments")
     fault = find_fault(first) if isinstance(first, RelativePose) else ""
     _require(not fault, f"{name}: {fault}")
     return first
@@ -181,24 +171,18 @@ def _check_agreement(name: str, difference: FloatArray, covariance: FloatArray) 
     if rotation < _NEGLIGIBLE_RAD and translation < _NEGLIGIBLE_M:
         return
     n_sigmas = float(np.sqrt(max(float(se3.mahalanobis(twist, covariance)), 0.0)))
-    _require(
-        n_sigmas <= _AGREEMENT_SIGMAS,
-        f"{name} disagree by {n_sigmas:.1f} sigma of their covariances "
-        f"({1e3 * rotation:.2f} mrad, {1e3 * translation:.2f} mm)",
-    )
+    off = f"{n_sigmas:.1f} sigma ({1e3 * rotation:.2f} mrad, {1e3 * translation:.2f} mm)"
+    _require(n_sigmas <= _AGREEMENT_SIGMAS, f"{name} disagree by {off}")
 
 
 def _check_inverse(
     frontend: Frontend[Any], forth: RelativePose, reference: Stamped, current: Stamped
 ) -> None:
     back = _find(frontend, current, reference)
+    name = f"register({reference.stamp_ns}, {current.stamp_ns})"
+    difference = forth.T_reference_current @ back.T_reference_current
     covariance = se3.compose_covariance(forth.covariance, back.T_reference_current, back.covariance)
-    _check_agreement(
-        f"register({reference.stamp_ns}, {current.stamp_ns}) and the inverse of what it gives "
-        "the other way round",
-        forth.T_reference_current @ back.T_reference_current,
-        covariance,
-    )
+    _check_agreement(f"{name} and its inverse the other way round", difference, covariance)
 
 
 def _check_prior(
@@ -234,8 +218,8 @@ def _check_direction(
     ahead = result.T_reference_current @ [0.0, 0.0, _SHIFT_DEPTH_M, 1.0]
     _require(
         ahead[0] > 0.0,
-        "register must return T_reference_current, which maps the current frame to the "
-        "reference: images shifted to the left are a turn to the right, and it says the opposite",
+        "register must return T_reference_current, which maps the current frame to the reference: "
+        "images shifted to the left are a turn to the right, and it says the opposite",
     )
 
 
@@ -254,10 +238,9 @@ def _without_anything(first: Stamped, last_ns: int, blank: Stamped | None) -> li
     uniform: dict[str, Any] = {name: np.full_like(image, 100) for name, image in images.items()}
     if "depth" in images:
         uniform["depth"] = np.full_like(images["depth"], np.nan)
+    grey = {name: image for name, image in images.items() if name != "depth"}
     noise: dict[str, Any] = {
-        name: rng.integers(0, 256, image.shape, dtype=np.uint8)
-        for name, image in images.items()
-        if name != "depth"
+        name: rng.integers(0, 256, image.shape, dtype=np.uint8) for name, image in grey.items()
     }
     contents = enumerate((uniform, noise), start=1)
     return frames + [replace(first, stamp_ns=last_ns + n, **each) for n, each in contents]
@@ -275,10 +258,8 @@ def _check_places(recognizer: Recognizer | None, seen: Stamped, frame: Stamped) 
     _require(not find_fault(result), f"{name}: {find_fault(result)}")
     _check_agreement(name, result.T_reference_current, result.covariance)
     result = recognizer.recognize(place, _place_of(recognizer, nothing), nothing)
-    stamps = f"{seen.stamp_ns}, {frame.stamp_ns}"
-    _require(
-        isinstance(result, Failure), f"frames without anything in common ({stamps}) are recognized"
-    )
+    name = f"frames without anything in common ({seen.stamp_ns}, {frame.stamp_ns})"
+    _require(isinstance(result, Failure), f"{name} are recognized")
 
 
 def _place_of(recognizer: Recognizer, observations: Stamped) -> Any:  # noqa: ANN401
@@ -304,9 +285,8 @@ def _check_nothing_seen(frontend: Frontend[Any], seen: Stamped, frame: Stamped) 
     except ContractError:
         raise
     except Exception as error:  # whatever it is, it is the breach that is looked for
-        raise ContractError(
-            f"{name} raise {type(error).__name__}: {error}; a Failure is expected"
-        ) from error
+        reason = f"{type(error).__name__}: {error}"
+        raise ContractError(f"{name} raise {reason}; a Failure is expected") from error
     for result in results:
         if not isinstance(result, Failure):
             raise ContractError(f"{name} are registered")

@@ -19,7 +19,6 @@ import argparse
 import ast
 import gc
 import json
-import math
 import os
 import random
 import signal
@@ -36,6 +35,7 @@ from typing import Any
 
 import coverage
 import pytest
+from scipy.stats import binomtest
 
 ROOT = Path(__file__).resolve().parents[2]
 PATHS = ("gvo/geometry", "gvo/backend", "gvo/kernels", "gvo/trajectory", "gvo/io/sync.py")
@@ -92,7 +92,7 @@ class Mutant:
 
 def mutants_of(path: Path) -> Iterator[Mutant]:
     """Yield all mutants of a file."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = ast.parse(path.read_text())
     for names, function in _functions(tree, ()):
         for parent, place, statement in _places(function, function):
             value = getattr(parent, place[0])
@@ -210,15 +210,6 @@ class Mutation:
     n_run: int = 0
     failed: bool = False
 
-    def pytest_collection(self) -> None:
-        """Make Hypothesis repeatable, before any test is imported."""
-        from hypothesis import Phase, settings  # not before pytest has rewritten it
-
-        phases = (Phase.explicit, Phase.generate)
-        options: Any = {"deadline": None, "derandomize": True, "database": None, "phases": phases}
-        settings.register_profile("mutation", **options)
-        settings.load_profile("mutation")
-
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         self.failed |= report.failed
 
@@ -231,14 +222,15 @@ class Mutation:
                 self._measure(session, answer)
                 os._exit(int(self.failed))
             if os.waitpid(pid, 0)[1]:
-                raise pytest.UsageError("the tests fail without a mutant")
-            seconds, reached = json.loads(answer.read_text(encoding="utf-8"))
+                failing = answer.read_text() if answer.exists() else "all of them"
+                raise SystemExit(f"mutation: without a mutant this fails: {failing}")
+            seconds, reached = json.loads(answer.read_text())
         gc.freeze()  # so that forks share what is there
         running: dict[int, Mutant] = {}
         for mutant in self.mutants:
             lines = reached.get(str(mutant.path), {})
-            tests = {test for line in mutant.lines for test in lines.get(str(line), [])}
-            chosen = sorted(tests, key=lambda test: seconds[test])
+            names = {name for line in mutant.lines for name in lines.get(str(line), []) if name}
+            chosen = sorted(map(int, names), key=lambda test: seconds[test])
             running[self._fork(mutant, session, chosen, seconds)] = mutant
             while len(running) >= self.jobs:
                 self._await(running)
@@ -258,16 +250,13 @@ class Mutation:
             start = time.process_time()
             _run_test(session, index, following)
             seconds.append(time.process_time() - start)
+            if self.failed:
+                answer.write_text(session.items[index].nodeid)
+                return
         tracer.stop()
         data = tracer.get_data()
-        reached = {
-            file: {
-                line: [int(name) for name in names if name]
-                for line, names in data.contexts_by_lineno(file).items()
-            }
-            for file in data.measured_files()
-        }
-        answer.write_text(json.dumps([seconds, reached]), encoding="utf-8")
+        reached = {file: data.contexts_by_lineno(file) for file in data.measured_files()}
+        answer.write_text(json.dumps([seconds, reached]))
 
     def _fork(
         self, mutant: Mutant, session: pytest.Session, tests: list[int], seconds: list[float]
@@ -337,16 +326,7 @@ def _hush() -> None:
         os.dup2(nothing, stream)
 
 
-def wilson(n_found: int, n: int) -> tuple[float, float]:
-    """Return the 95 % interval of a share of which a sample is known."""
-    z, share = 1.96, n_found / n
-    middle = share + z * z / (2 * n)
-    half = z * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
-    return (middle - half) / (1 + z * z / n), (middle + half) / (1 + z * z / n)
-
-
 def main() -> int:
-    """Parse the arguments, plant the faults, and return 1 where too few are noticed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--paths", nargs="+", default=PATHS, help="files or folders to change")
     parser.add_argument("--tests", nargs="+", default=TESTS, help="tests that should notice")
@@ -361,13 +341,13 @@ def main() -> int:
     random.Random(arguments.seed).shuffle(every)
     mutation = Mutation(mutants=every[: arguments.sample], jobs=arguments.jobs)
     tests = [test for test in arguments.tests if Path(test).exists()]
-    options = ["-q", "-p", "no:cacheprovider", "-n", "0", "--assert=plain"]
+    options = ["-q", "-p", "no:cacheprovider", "-n", "0", "--hypothesis-seed=0"]
     with Path(os.devnull).open("w") as nothing, redirect_stdout(nothing):
         code = pytest.main([*options, *tests], plugins=[mutation])
-    if code not in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED):
-        return int(code)
+    if mutation.n_run == 0:
+        raise SystemExit(f"mutation: no mutant could be run (pytest ended with {code})")
     n_killed = mutation.n_run - len(mutation.survivors)
-    low, high = wilson(n_killed, mutation.n_run)
+    low, high = binomtest(n_killed, mutation.n_run).proportion_ci(method="wilson")
     print(
         f"{n_killed} of {mutation.n_run} noticed ({100 * n_killed / mutation.n_run:.1f} %); "
         f"{100 * low:.1f} to {100 * high:.1f} % of all {len(every)}"

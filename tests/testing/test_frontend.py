@@ -331,7 +331,7 @@ class OffByAFewSigmas(ScanFrontend):
         ("a prior", "with and without a prior disagree by 5.1 sigma"),
     ],
 )
-def test_contradictions_are_let_pass_up_to_five_sigma(respect: str, reason: str) -> None:
+def test_s_are_let_pass_up_to_five_sigma(respect: str, reason: str) -> None:
     scans = [Scan(n, se3.exp(np.array([0.0, 0.1 * n, 0.0, 0.0, 0.0, 0.0]))) for n in range(3)]
     check_frontend(OffByAFewSigmas(respect, 4.9), scans)
     with pytest.raises(ContractError, match=reason):

@@ -124,11 +124,7 @@ class View:
 
 
 def look(scene: Scene, T_map_cam: FloatArray, camera: PinholeCamera) -> View:
-    """Keep the rectangles in view and express them as linear forms of the pixel.
-
-    `T_map_cam` maps camera coordinates to the map: shape (4, 4), or (height, 4, 4) with a pose
-    for each row.
-    """
+    """Express the rectangles in view as linear forms of the pixel, of one pose or of each row."""
     T_cam_map, K_inverse = invert(T_map_cam), np.linalg.inv(camera.K)
     keep = _in_view(scene, T_cam_map, camera)
     R = T_cam_map[..., :3, :3]

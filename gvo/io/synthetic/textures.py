@@ -57,11 +57,6 @@ class TextureAtlas:
 
     Level (i, j) of a texture is 2^i times narrower and 2^j times lower, so that surfaces seen
     at a grazing angle are blurred along one direction only.
-
-    Parameters
-    ----------
-    textures : sequence of Texture
-        All of one size.
     """
 
     def __init__(self, textures: Sequence[Texture]) -> None:
@@ -89,33 +84,14 @@ class TextureAtlas:
     def locate(
         self, texels: NDArray[np.float32], footprints: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """Return where in the atlas texture coordinates lie, relative to the texture's corner.
-
-        Parameters
-        ----------
-        texels : ndarray of float32
-            Coordinates along one axis, the first texel's centre at 0.5, any period.
-        footprints : ndarray of float32, the same shape
-            Texels per pixel; the level whose texel is nearest to one pixel is taken.
-        """
+        """Return where in the atlas texture coordinates lie, relative to the texture's corner."""
         exponents = (footprints * np.float32(np.sqrt(2.0))).view(np.int32) >> 23
         levels = np.clip(exponents - 127, 0, len(self._scales) - 1)
         wrapped = texels - np.floor(texels * np.float32(1.0 / self.size)) * np.float32(self.size)
         return np.asarray(wrapped * self._scales.take(levels) + self._starts.take(levels))
 
     def sample(self, map_x: NDArray[np.float32], map_y: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the grey values at positions in the atlas, bilinear.
-
-        Parameters
-        ----------
-        map_x, map_y : ndarray of float32, shape (n,) or (h, w)
-            Column and row in the atlas, texels.
-
-        Returns
-        -------
-        ndarray of float32, of the same shape
-            0 to 255.
-        """
+        """Return the grey values at positions in the atlas, bilinear."""
         shape = map_x.shape
         if map_x.ndim == 1:  # cv2.remap writes images of fewer than 2^15 rows
             pad = -len(map_x) % 256
@@ -129,21 +105,7 @@ class TextureAtlas:
     def is_opaque(
         self, texture: int, level: int, s: NDArray[np.float32], t: NDArray[np.float32]
     ) -> BoolArray:
-        """Tell where a texture is opaque.
-
-        Parameters
-        ----------
-        texture : int
-            Index of a texture that has a mask.
-        level : int
-            Of the mask's pyramid: 0 is the finest.
-        s, t : ndarray of float32, shape (n,) or (h, w)
-            Texture coordinates, texels of the finest level.
-
-        Returns
-        -------
-        ndarray of bool, of the same shape
-        """
+        """Tell where a texture is opaque."""
         masks = self._masks[texture]
         mask = masks[min(level, len(masks) - 1)]
         n = len(mask)
@@ -188,16 +150,7 @@ def gradient(top: float, bottom: float) -> Canvas:
 
 
 def noise(rng: np.random.Generator, *, exponent: float = 1.0, largest: float = 0.5) -> Canvas:
-    """Return periodic noise of unit variance whose amplitudes fall as 1/f^exponent.
-
-    Parameters
-    ----------
-    rng : Generator
-    exponent : float
-        0 is white, 1 is like natural images, 2 is cloudy.
-    largest : float
-        Largest wavelength as a share of the canvas.
-    """
+    """Return periodic noise of unit variance whose amplitudes fall as 1/f^exponent."""
     f = _frequencies()
     half = np.where(f < 1.0 / largest, 0.0, np.maximum(f, 1.0) ** np.float32(-exponent))
     amplitudes = np.concatenate([half, half[-2:0:-1]])  # those of -f_y are those of f_y
@@ -216,18 +169,7 @@ def _frequencies() -> Canvas:
 def bricks(
     rng: np.random.Generator, n_columns: int, n_rows: int, *, joint: int = 2, shift: float = 0.5
 ) -> Canvas:
-    """Return a bond of bricks: the tone of each normally distributed, joints at -3.
-
-    Parameters
-    ----------
-    rng : Generator
-    n_columns, n_rows : int
-        Bricks in a period, the rows an even number.
-    joint : int
-        Width of the joints, texels.
-    shift : float
-        Of every second row, in bricks.
-    """
+    """Return a bond of bricks: the tone of each normally distributed, joints at -3."""
     y = np.arange(N_TEXELS) * (n_rows / N_TEXELS)
     row = y.astype(np.int64)
     # Of an even and of an odd row: each texel of a row has its place in one of these.

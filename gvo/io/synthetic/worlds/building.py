@@ -23,17 +23,7 @@ def stretched(texture: str) -> Rectangle:
 def wall(
     left: FloatArray, right: FloatArray, heights: tuple[float, float], texture: Rectangle
 ) -> Rectangle:
-    """Stand a rectangle on the ground.
-
-    Parameters
-    ----------
-    left, right : ndarray of float64, shape (2,)
-        Its ends as seen from its front, x and y in metres.
-    heights : (float, float)
-        Bottom and top, metres.
-    texture : Rectangle
-        What all but corner and edges are taken from.
-    """
+    """Stand a rectangle on the ground."""
     bottom, top = heights
     along, down = np.append(right - left, 0.0), (0.0, 0.0, bottom - top)
     return replace(texture, corner=np.append(left, top), edge_s=along, edge_t=down)
@@ -42,17 +32,7 @@ def wall(
 def slab(
     start: FloatArray, end: FloatArray, width: float, height: float, texture: Rectangle
 ) -> Rectangle:
-    """Lay a rectangle flat, seen from above; `start` to `end` is its middle line.
-
-    Parameters
-    ----------
-    start, end : ndarray of float64, shape (2,)
-        x and y in metres.
-    width, height : float
-        Across the line, and above the ground, metres.
-    texture : Rectangle
-        What all but corner and edges are taken from.
-    """
+    """Lay a rectangle flat, seen from above; `start` to `end` is its middle line."""
     along = end - start
     aside = np.array([along[1], -along[0]]) / np.linalg.norm(along)
     corner = np.append(end - 0.5 * width * aside, height)
@@ -76,23 +56,7 @@ def box(
     bottom: float = 0.0,
     top: Rectangle | None = None,
 ) -> list[Rectangle]:
-    """Return four walls and the top of a box; the wall facing backwards comes first.
-
-    Parameters
-    ----------
-    center : ndarray of float64, shape (2,)
-        x and y in metres.
-    angle : float
-        Heading in radians, 0 is along y.
-    size : (float, float, float)
-        Along the heading, across it, upwards; metres.
-    texture : Rectangle
-        What all but corner and edges are taken from.
-    bottom : float
-        Height of the lower side above the ground, metres.
-    top : Rectangle, optional
-        The same for the top.
-    """
+    """Return four walls and the top of a box; the wall facing backwards comes first."""
     length, width, height = size
     forward, right = ground_axes(angle)
     f, r = 0.5 * length * forward, 0.5 * width * right

@@ -62,33 +62,14 @@ def _lap() -> CubicSpline:
 
 
 def road_point(s: FloatArray | float, right: FloatArray | float = 0.0) -> FloatArray:
-    """Return points beside the driven line.
-
-    Parameters
-    ----------
-    s : float or ndarray of float64, shape (...)
-        Arc length, metres; the road is a closed lap.
-    right : float or ndarray of float64, shape (...)
-        Distance to the right of the driven line, metres.
-
-    Returns
-    -------
-    ndarray of float64, shape (..., 2)
-        x and y in the `map` frame.
-    """
+    """Return points beside the driven line."""
     psi = heading(s)
     aside = np.stack([np.cos(psi), np.sin(psi)], axis=-1)
     return np.asarray(_lap()(s % LAP_M) + aside * np.asarray(right)[..., np.newaxis])
 
 
 def drive(stamps_s: FloatArray) -> FloatArray:
-    """Return T_map_cam, shape (n, 4, 4), of a car at 5 to 11 m/s on a slightly uneven road.
-
-    Parameters
-    ----------
-    stamps_s : ndarray of float64, shape (n,)
-        Seconds since the start.
-    """
+    """Return T_map_cam, shape (n, 4, 4), of a car at 5 to 11 m/s on a slightly uneven road."""
     t = stamps_s
     # The integral of 8.2 + 2 sin(0.6 t) + 0.8 sin(1.7 t + 1) m/s.
     s = _START_M + 8.2 * t - 2 / 0.6 * (np.cos(0.6 * t) - 1)
@@ -99,33 +80,12 @@ def drive(stamps_s: FloatArray) -> FloatArray:
 def drive_along(
     stamps_s: FloatArray, s: FloatArray, *, shake: FloatArray | float = 1.0
 ) -> FloatArray:
-    """Return T_map_cam, shape (n, 4, 4), of a car on a slightly uneven road.
-
-    Parameters
-    ----------
-    stamps_s : ndarray of float64, shape (n,)
-        Seconds since the start.
-    s : ndarray of float64, shape (n,)
-        Where the car is then: arc lengths in metres.
-    shake : float or ndarray of float64, shape (n,)
-        Factor on how much the road shakes the car; 0 while it stands.
-    """
+    """Return T_map_cam, shape (n, 4, 4), of a car on a slightly uneven road."""
     return _by_car(stamps_s, road_point(s), heading(s), shake)
 
 
 def drive_block(seed: int, stamps_s: FloatArray) -> FloatArray:
-    """Return T_map_cam, shape (n, 4, 4), of a car that drives a lap, goes on, turns and comes back.
-
-    From s = 30 m of the road it closes the lap at 430 m, drives over the same road until it turns
-    at 525 m, and back in the other lane to 450 m; at some 10 m/s, and slowly where it turns.
-
-    Parameters
-    ----------
-    seed : int
-        Of its speed, and of where in its lane it drives.
-    stamps_s : ndarray of float64, shape (n,)
-        Seconds since the start.
-    """
+    """Return T_map_cam (n, 4, 4) of a car: a lap and more of the same road, then back."""
     line, way = _block_line(seed)
     driven = way(np.minimum(stamps_s, way.x[-1]))
     along = line(driven, 1)
@@ -174,13 +134,7 @@ def _by_car(
 
 
 def look_around(stamps_s: FloatArray) -> FloatArray:
-    """Return T_map_cam, shape (n, 4, 4), of a camera held in the hand.
-
-    Parameters
-    ----------
-    stamps_s : ndarray of float64, shape (n,)
-        Seconds since the start.
-    """
+    """Return T_map_cam, shape (n, 4, 4), of a camera held in the hand."""
     t = stamps_s[:, np.newaxis]
     amplitudes = np.array([0.22, 0.14, 0.12, 0.05, 0.05, 0.03])  # m
     rates = np.array([0.9, 0.75, 1.1, 2.3, 2.0, 2.6])  # rad/s
@@ -193,17 +147,7 @@ def look_around(stamps_s: FloatArray) -> FloatArray:
 
 
 def turn_fast(seed: int, stamps_s: FloatArray) -> FloatArray:
-    """Return T_map_cam, shape (n, 4, 4), of a hand that turns the camera to and fro.
-
-    About all three axes, at up to some 85 deg/s, back to what was seen before within seconds.
-
-    Parameters
-    ----------
-    seed : int
-        Of rates and phases.
-    stamps_s : ndarray of float64, shape (n,)
-        Seconds since the start.
-    """
+    """Return T_map_cam, shape (n, 4, 4), of a hand that turns the camera to and fro."""
     t = stamps_s[:, np.newaxis]
     rng = np.random.default_rng([seed, 7])
     rates = np.array([1.3, 1.0, 1.6, 2.6, 1.9, 2.3]) * rng.uniform(0.9, 1.1, 6)  # rad/s
@@ -214,17 +158,7 @@ def turn_fast(seed: int, stamps_s: FloatArray) -> FloatArray:
 
 
 def hover(seed: int, stamps_s: FloatArray) -> FloatArray:
-    """Return T_map_cam, shape (n, 4, 4), of a drone that flies for 2 s and hovers for 3 s, in turn.
-
-    It goes around eight places. Where it hovers it jitters by a few millimetres.
-
-    Parameters
-    ----------
-    seed : int
-        Of the places and the jitter.
-    stamps_s : ndarray of float64, shape (n,)
-        Seconds since the start.
-    """
+    """Return T_map_cam (n, 4, 4) of a drone that flies for 2 s and hovers for 3 s, in turn."""
     rng = np.random.default_rng([seed, 8])
     reach = np.array([0.6, 0.4, 0.25, 0.12, 0.4])  # m; rad of pitch and yaw
     places = reach * rng.uniform(-1.0, 1.0, (_N_PLACES, 5))

@@ -27,13 +27,7 @@ _NORTH, _EAST, _WEST = 0.0, -0.5 * np.pi, 0.5 * np.pi
 
 @lru_cache(maxsize=2)
 def room(seed: int) -> Scene:
-    """Furnish the room; the same seed gives the same bytes.
-
-    Returns
-    -------
-    Scene
-        Some 250 rectangles, map axes with z up.
-    """
+    """Furnish the room; the same seed gives the same bytes."""
     return make_scene(room_rectangles(), room_textures(seed), LAMP)
 
 

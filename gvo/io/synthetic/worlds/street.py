@@ -49,13 +49,7 @@ _OVERCAST = Light(direction=(0.0, 0.0, 1.0), ambient=0.95, direct=0.15, haze_m=6
 
 @lru_cache(maxsize=2)
 def street(seed: int) -> Scene:
-    """Build the street; the same seed gives the same bytes.
-
-    Returns
-    -------
-    Scene
-        Some 2000 rectangles, map axes with z up, the road at height 0.
-    """
+    """Build the street; the same seed gives the same bytes."""
     return make_scene(street_rectangles(seed), street_textures(seed), DAYLIGHT)
 
 
@@ -72,16 +66,7 @@ def street_rectangles(seed: int) -> list[Rectangle]:
 
 @lru_cache(maxsize=2)
 def block(seed: int) -> Scene:
-    """Build the street for a drive around the block, with a twin of its first side.
-
-    Houses, trees and posts along the third side of the block are those along its first one: who
-    drives there sees the same, but for parked cars, the age of the paint and the horizon.
-
-    Returns
-    -------
-    Scene
-        Some 2000 rectangles, map axes with z up, the road at height 0, under an overcast sky.
-    """
+    """Build the street for a drive around the block, with a twin of its first side."""
     return make_scene(block_rectangles(seed), street_textures(seed), _OVERCAST)
 
 
