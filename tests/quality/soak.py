@@ -53,7 +53,7 @@ class EndlessDrive:
         world = replace(WORLDS["driving"], name="endless", motion=lambda _: lap)
         noise = SensorNoise(exposure_drift=0.0)
         lap_once = SyntheticRecording(world, n_frames=N_LAP, scale=0.2, noise=noise)
-        self._order, self.n_frames = list(order), n_frames
+        self._order, self.n_frames = list(order)[:n_frames], n_frames
         images = list(lap_once.images())
         self._pairs = {k: [i.load() for i in images[2 * k : 2 * k + 2]] for k in {*self._order}}
         self.info = replace(lap_once.info, n_images=n_frames)

@@ -16,7 +16,6 @@ from gvo.frontend.klt import KltFrontend, KltObservations
 from gvo.geometry import se3
 from gvo.io.recording import Sensor
 from gvo.testing import ContractError, check_frontend
-from gvo.testing.frontend import fingerprint
 from gvo.types import Failure, FloatArray, Frame, MotionPrior, Observations, RelativePose
 from tests.recordings import frames_of
 
@@ -284,22 +283,6 @@ def test_front_ends_of_other_sensors_are_checked_with_their_own_blank_frame() ->
     check_frontend(ScanFrontend(), scans, blank=Scan(9, None))
     with pytest.raises(ContractError, match="are registered"):
         check_frontend(ScanFrontend(), scans, blank=Scan(9, np.eye(4)))
-
-
-@pytest.mark.parametrize(
-    "pair",
-    [
-        (np.zeros(3), np.zeros(3, dtype=np.float32)),
-        (np.zeros((2, 3)), np.zeros((3, 2))),
-        ([1, 2], [2, 1]),
-        ({"a": np.ones(2)}, {"b": np.ones(2)}),
-        (Scan(1, np.eye(4)), Scan(1, np.eye(4) + 1e-16 * np.ones((4, 4)))),
-        ((1, None), (1, 0)),
-    ],
-)
-def test_different_values_have_different_fingerprints(pair: tuple[object, object]) -> None:
-    assert fingerprint(pair[0]) != fingerprint(pair[1])
-    assert fingerprint(pair[0]) == fingerprint(pair[0])
 
 
 class OffByAFewSigmas(ScanFrontend):
