@@ -320,13 +320,13 @@ def compare(
     from gvo.io.poses.inputs import read_compared
     from gvo.io.run_folder.line_file import check_new
     from gvo.trajectory.evaluation import evaluate, evaluations_json, format_evaluations
-    from gvo.viz.plots import check_suffix
+    from gvo.viz.names import PAGES, check_suffix
 
     for path in (plot, report_file, plots):
         if path is not None and not force:
             check_new(path, otherwise="--force to replace it")
     check_suffix(plot)
-    check_suffix(report_file, (".html", ".htm"))
+    check_suffix(report_file, PAGES)
     truth, trajectories, notes = read_compared(reference, estimates)
     warn(notes)
     lengths = None if segments is None else _parse_lengths(segments)

@@ -23,7 +23,6 @@ from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 
-from gvo._trace import note
 from gvo.config import Config
 from gvo.frontend.registration import check_rows, estimate_roughly, register_correspondences
 from gvo.geometry import se3
@@ -409,12 +408,6 @@ class RigOffsets:
             left_s = used_s + error.value - self.readout.value
             self.readout.update(left_s, _READOUT_FACTOR * error.sigma)
         self._disparity_error, self._row_px, self._readout_errors = None, None, []
-        note(
-            "rig.offsets",
-            disparity_px=self.disparity_px,
-            row_px=self.row.value,
-            readout_ms=1e3 * self.readout_s,
-        )
 
     def as_json(self) -> dict[str, float]:
         """Return values and sigmas as plain numbers; a sigma of 0: it was given."""
@@ -549,6 +542,11 @@ class Measurements:
     sigma_factor: float
 
 
+def _hints(measured: Measurements, prior: MotionPrior | None) -> dict[str, Any]:
+    first, second = measured.frames
+    return {"stamps_ns": (first.stamp_ns, second.stamp_ns), "prior": prior}
+
+
 class CalibratedCamera:
     """Takes what is known of a camera's errors off measurements, and registers these.
 
@@ -601,10 +599,8 @@ class CalibratedCamera:
         """
         velocities = self._offsets.velocities
         first, second = measured.frames
-        hints: dict[str, Any] = {"stamps_ns": (first.stamp_ns, second.stamp_ns), "prior": prior}
-        # A first step has no velocity yet to start from.
-        if is_step and velocities.of(first) is not None and self._offsets.possible_readout_s:
-            hints["T_start"] = self._move_rows(measured, config, hints)
+        T_start = self.begin(measured, config, prior=prior, is_step=is_step)
+        hints: dict[str, Any] = {**_hints(measured, prior), "T_start": T_start}
         result = self._register(measured, config, hints)
         if isinstance(result, Failure) and hints.pop("T_start", None) is not None:
             # What was found roughly may be the other one of two motions, or none.
@@ -616,6 +612,19 @@ class CalibratedCamera:
             velocities.expect(first, second, result.T_reference_current)
         self._offered[result] = measured
         return check_rows(result, self._camera)
+
+    def begin(
+        self, measured: Measurements, config: Config, *, prior: MotionPrior | None, is_step: bool
+    ) -> FloatArray | None:
+        """Take over the velocities of a step, estimated roughly; return it, T_target_source.
+
+        None where rows need no velocities, or where that fails.
+        """
+        # A first step has no velocity yet to start from.
+        has_velocity = self._offsets.velocities.of(measured.frames[0]) is not None
+        if is_step and has_velocity and self._offsets.possible_readout_s:
+            return self._move_rows(measured, config, _hints(measured, prior))
+        return None
 
     def accept(self, result: RelativePose, config: Config, *, is_step: bool) -> None:
         """Learn from a registration that passed all checks; from the others nothing is learnt."""
@@ -649,10 +658,8 @@ class CalibratedCamera:
     def _register(
         self, measured: Measurements, config: Config, hints: Mapping[str, Any]
     ) -> RelativePose | Failure:
-        told = self._offsets.velocities.measured(measured.frames[1])
-        # A step that was adjusted with it knows already what the velocity does to it.
-        is_adjusted = told is not None and hints.get("T_start") is not None
-        prepared = self._prepared(measured, is_adjusted=is_adjusted)
+        T_start = hints.get("T_start")
+        prepared = self.prepare(measured, T_start)
         result = register_correspondences(prepared, measured.matches, self._camera, config, **hints)
         if isinstance(result, Failure):
             return result
@@ -663,9 +670,10 @@ class CalibratedCamera:
         effects |= {name: each.effect for name, each in constants.items()}
         by_learnt, by_axis = np.split(np.array([*effects.values()]), [2])
         known = np.eye(len(by_axis))
+        told = self._offsets.velocities.measured(measured.frames[1])
         if told is not None:
             known = told.found.covariance
-            by_axis = told.found.effects.T if is_adjusted else by_axis
+            by_axis = by_axis if T_start is None else told.found.effects.T
         by_velocity = by_axis.T @ known @ by_axis
         by_velocity = 0.5 * (by_velocity + by_velocity.T)  # symmetric in spite of rounding
         return replace(
@@ -724,11 +732,13 @@ class CalibratedCamera:
         reference, current = (
             self.correct(*each) for each in zip(measured.frames, measured.uvd, strict=True)
         )
-        note("rows.settled", measured=measured.uvd[1] - self._offset(), settled=current)
         return Correspondences.of_pixels((reference, current), measured.sigmas, self._camera)
 
-    def _prepared(self, measured: Measurements, *, is_adjusted: bool = False) -> Correspondences:
+    def prepare(self, measured: Measurements, T_start: FloatArray | None) -> Correspondences:
         """Return what was measured, corrected, with its derivatives by what is in doubt."""
+        # A step that was adjusted with it knows already what the velocity does to it.
+        told = self._offsets.velocities.measured(measured.frames[1])
+        is_adjusted = told is not None and T_start is not None
         corrected = self._corrected(measured)
         sensitivities = {
             name: self._sensitivity(name, measured) * constant.sigma
@@ -754,7 +764,7 @@ class CalibratedCamera:
         for measured, result in links or (told_by if self._offsets.possible_readout_s else ()):
             T = se3.invert(result.T_reference_current)
             residuals = StereoResiduals.of(
-                T, self._prepared(measured), self._camera, huber=config.registration.huber
+                T, self.prepare(measured, None), self._camera, huber=config.registration.huber
             ).select(result.inliers)
             at = residuals.linearize(T)
             told = {} if isinstance(at, Failure) else estimate_constants(T, residuals, at)

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from gvo._trace import note
 from gvo.config import Config
 from gvo.frontend.calibration import CalibratedCamera, Measurements, RigOffsets
 from gvo.frontend.features import FeatureExtractor, Features, thin
@@ -61,7 +60,7 @@ class DescriptorFrontend:
         self.camera = as_stereo(camera)
         is_stereo = isinstance(camera, StereoCamera)
         self.rig_offsets = rig_offsets or RigOffsets(config, is_stereo=is_stereo)
-        self._calibrated = CalibratedCamera(self.camera, self.rig_offsets)
+        self.calibrated = CalibratedCamera(self.camera, self.rig_offsets)
         self._config = config
         self._extractors = [FeatureExtractor(config.features) for _ in range(2)]
         self._pool = ThreadPoolExecutor(1) if config.runtime.threads > 1 else None
@@ -85,14 +84,6 @@ class DescriptorFrontend:
         pixels = left.keypoints[pairs[:, 0]], right.keypoints[pairs[:, 1]]
         disparities, is_valid = refine_disparities((frame.left, frame.right), *pixels, config)
         is_in_range = is_in_depth_range(disparities - self._offset_px(), self.camera, config)
-        note(
-            "descriptor.stereo",
-            features=(left, right),
-            pairs=pairs,
-            disparities=disparities,
-            is_fitted=is_valid,
-            is_in_range=is_in_range,
-        )
         is_valid &= is_in_range
         return self._observe(frame.stamp_ns, left, right, pairs[is_valid], disparities[is_valid])
 
@@ -106,7 +97,6 @@ class DescriptorFrontend:
     def _extract_rgbd(self, frame: RgbdFrame) -> Observations:
         features = self._extractors[0].extract(frame.image)
         depths, is_valid = sample_depth(frame.depth, features.keypoints, self._config.depth)
-        note("descriptor.depth", features=features, depths=depths, is_valid=is_valid)
         chosen = np.flatnonzero(is_valid)
         disparities = self.camera.depth_to_disparity(depths[chosen])
         pairs = np.stack([chosen, chosen], axis=1)
@@ -158,21 +148,19 @@ class DescriptorFrontend:
         """
         result = self._register(reference, current, prior)
         if isinstance(result, RelativePose):
-            is_step = prior is None or prior.T_recent is not None
-            self._calibrated.accept(result, self._config, is_step=is_step)
+            self.calibrated.accept(result, self._config, is_step=is_step(prior))
         return result
 
     def _register(
         self, reference: Observations, current: Observations, prior: MotionPrior | None
     ) -> RelativePose | Failure:
-        narrow, wide = self._config.temporal.radius_px, self._config.temporal.wide_radius_px
         if prior is not None:
-            result = self._register_within(reference, current, prior, narrow)
+            result = self._register_within(reference, current, prior, is_wide=False)
             if not prior.is_confirmed:
                 result = check_view(result, reference.points_cam, self.camera)
             if isinstance(result, RelativePose | Contradiction):
                 return result
-        rough = self._register_within(reference, current, prior, wide)
+        rough = self._register_within(reference, current, prior, is_wide=True)
         if isinstance(rough, Failure):
             return rough
         # Nothing predicted it: what else it predicts must be there too.
@@ -212,8 +200,7 @@ class DescriptorFrontend:
     ) -> RelativePose | Failure:
         """Match again around the pixels that a motion predicts, and check the view."""
         prior = MotionPrior(T_predicted=rough.T_reference_current)
-        radius_px = self._config.temporal.radius_px
-        result = self._register_within(reference, current, prior, radius_px)
+        result = self._register_within(reference, current, prior, is_wide=False)
         return check_view(result, reference.points_cam, self.camera)
 
     def _offset_px(self) -> float:
@@ -224,46 +211,45 @@ class DescriptorFrontend:
         reference: Observations,
         current: Observations,
         prior: MotionPrior | None,
-        radius_px: float,
+        *,
+        is_wide: bool,
     ) -> RelativePose | Failure:
-        T_predicted = None if prior is None else prior.T_predicted
-        is_step = prior is None or prior.T_recent is not None
-        if is_step:
-            self.rig_offsets.velocities.expect(reference, current, T_predicted)
-        matches = self._match(reference, current, T_predicted, radius_px)
-        measured = Correspondences.of(reference, current, matches)
-        return self._calibrated.register(
-            Measurements(
-                frames=(reference, current),
-                uvd=(measured.source_uvd, measured.target_uvd),
-                sigmas=(measured.source_sigmas, measured.target_sigmas),
-                matches=matches,
-                sigma_factor=_SIGMA_FACTOR,
-            ),
+        return self.calibrated.register(
+            self.measure(reference, current, prior, is_wide=is_wide),
             self._config,
             prior=prior,
-            is_step=is_step,
+            is_step=is_step(prior),
         )
 
-    def _match(
+    def measure(
         self,
         reference: Observations,
         current: Observations,
-        T_predicted: FloatArray | None,
-        radius_px: float,
-    ) -> IntArray:
+        prior: MotionPrior | None,
+        *,
+        is_wide: bool,
+    ) -> Measurements:
+        """Match two frames in a window around the pixels that a prior predicts."""
+        T_predicted = None if prior is None else prior.T_predicted
+        if is_step(prior):
+            self.rig_offsets.velocities.expect(reference, current, T_predicted)
         predicted = predict_pixels(reference, T_predicted, self.camera)
-        note(
-            "attempt",
-            method="descriptors",
-            prior=T_predicted,
-            is_wide=radius_px == self._config.temporal.wide_radius_px,
-            radius_px=float(radius_px),
-            predicted=predicted,
-            pixels=(reference.keypoints, current.keypoints),
-        )
         config = self._config.temporal
-        return match_temporal(reference, current, predicted, config, radius_px=radius_px)
+        radius_px = config.wide_radius_px if is_wide else config.radius_px
+        matches = match_temporal(reference, current, predicted, config, radius_px=radius_px)
+        measured = Correspondences.of(reference, current, matches)
+        return Measurements(
+            frames=(reference, current),
+            uvd=(measured.source_uvd, measured.target_uvd),
+            sigmas=(measured.source_sigmas, measured.target_sigmas),
+            matches=matches,
+            sigma_factor=_SIGMA_FACTOR,
+        )
+
+
+def is_step(prior: MotionPrior | None) -> bool:
+    """Tell whether a registration is a step of the chain; keyframes have no recent motion."""
+    return prior is None or prior.T_recent is not None
 
 
 def as_stereo(camera: StereoCamera | PinholeCamera) -> StereoCamera:

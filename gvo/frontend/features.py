@@ -26,7 +26,6 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from gvo._trace import note
 from gvo.config import FeaturesConfig
 from gvo.types import FloatArray, ImageArray, IntArray
 
@@ -223,9 +222,7 @@ def choose_spread(
     ranks = np.empty(len(pixels), dtype=np.uint16)
     ranks[by_cell] = np.minimum(rank_in_group(cells[by_response][by_cell]), 65535)
     # The first of every cell before the second of any: the weakest rank is cut by response.
-    chosen = np.sort(by_response[np.argsort(ranks, kind="stable")[:n_chosen]])
-    note("keypoints.spread", pixels=pixels, chosen=chosen)
-    return chosen
+    return np.sort(by_response[np.argsort(ranks, kind="stable")[:n_chosen]])
 
 
 def rank_in_group(sorted_groups: NDArray[Any]) -> IntArray:

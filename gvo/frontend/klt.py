@@ -9,7 +9,6 @@ from typing import Literal, Protocol, TypeAlias, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from gvo._trace import note
 from gvo.config import Config
 from gvo.frontend.calibration import KLT_SIGMA_FACTOR, CalibratedCamera, Measurements, RigOffsets
 from gvo.frontend.depth_icp import DepthAligner
@@ -25,7 +24,6 @@ from gvo.frontend.tracking import (
     N_WIDE_LEVELS,
     RADIUS_PX,
     SPACING_PX,
-    WINDOW_RADIUS_PX,
     Templates,
     detect_corners,
     halve,
@@ -103,7 +101,7 @@ class KltFrontend:
         self.camera = as_stereo(camera)
         self._is_stereo = isinstance(camera, StereoCamera)
         self.rig_offsets = rig_offsets or RigOffsets(config, is_stereo=self._is_stereo)
-        self._calibrated = CalibratedCamera(self.camera, self.rig_offsets)
+        self.calibrated = CalibratedCamera(self.camera, self.rig_offsets)
         self._config = config
         self._depths = DepthAligner(self.camera, config.depth)
 
@@ -139,7 +137,6 @@ class KltFrontend:
         else:
             disparities, is_valid = self._measure_depth(frame, corners)
             slopes = np.zeros_like(corners)
-        note("klt.corners", corners=corners, disparities=disparities, is_valid=is_valid)
         keypoints, disparities = corners[is_valid], disparities[is_valid]
         return KltCorners(
             keypoints=keypoints,
@@ -176,7 +173,7 @@ class KltFrontend:
             result = self._check_depth(reference, current, result)
         if isinstance(result, RelativePose):
             is_step = prior is None or prior.T_recent is not None
-            self._calibrated.accept(result, self._config, is_step=is_step)
+            self.calibrated.accept(result, self._config, is_step=is_step)
             if is_step:
                 self.rig_offsets.note_rows(reference.corners.row_px)
         return result
@@ -206,7 +203,7 @@ class KltFrontend:
         a sample of tracks is not found either.
         """
         frames = reference, current
-        expected = self._predict(prior.T_predicted, *frames)
+        expected = self.predict(prior.T_predicted, *frames)
         aligned = self._register_link(prior, *frames, expected, "aligned")
         if isinstance(aligned, Contradiction):
             return aligned
@@ -223,12 +220,12 @@ class KltFrontend:
         return tracked if is_more else aligned
 
     def _is_seen_again(
-        self, reference: KltObservations, current: KltObservations, expected: _Expected
+        self, reference: KltObservations, current: KltObservations, expected: Expected
     ) -> bool:
         """Tell whether enough of a sample of the points in view are tracked."""
         n = len(expected.indices)
         sample = expected.take(np.arange(0, n, n // _N_SAMPLED + 1))
-        _, is_tracked = self._find_tracks(reference, current, sample, "near")
+        _, is_tracked = self.find_tracks(reference, current, sample, "near")
         return bool(np.count_nonzero(is_tracked) >= _MIN_SHARE_TRACKED * len(is_tracked))
 
     def _register_widely(
@@ -306,7 +303,7 @@ class KltFrontend:
         if isinstance(rough, Failure):
             return rough
         prior = MotionPrior(T_predicted=rough.T_reference_current)
-        expected = self._predict(prior.T_predicted, reference, observations)
+        expected = self.predict(prior.T_predicted, reference, observations)
         result = self._register_link(prior, reference, observations, expected, "aligned")
         points, frame = reference.depth_points, observations.frame
         checked = self._check_view(result, reference, points, frame)
@@ -372,28 +369,40 @@ class KltFrontend:
         search: _Search,
     ) -> RelativePose | Failure:
         """Track from the pixels that a motion predicts, measure in 3-D, register."""
+        is_wide = search == "wide"
+        return self.calibrated.register(
+            self.measure(reference, current, prior, is_wide=is_wide),
+            self._config,
+            prior=None if is_wide else prior,
+            is_step=True,
+        )
+
+    def measure(
+        self,
+        reference: KltObservations,
+        current: KltObservations,
+        prior: MotionPrior | None,
+        *,
+        is_wide: bool,
+    ) -> Measurements:
+        """Track the corners of a step from the pixels that its prior predicts; measure them."""
         T_predicted = None if prior is None else prior.T_predicted
         self.rig_offsets.velocities.expect(reference, current, T_predicted)
         T = np.eye(4) if T_predicted is None else T_predicted
-        expected = self._predict(T, reference, current)
-        return self._calibrated.register(
-            self._track(reference, current, expected, search),
-            self._config,
-            prior=None if search == "wide" else prior,
-            is_step=True,
-        )
+        expected = self.predict(T, reference, current)
+        return self._track(reference, current, expected, "wide" if is_wide else "near")
 
     def _register_link(
         self,
         prior: MotionPrior,
         reference: _Reference,
         current: KltObservations,
-        expected: _Expected,
+        expected: Expected,
         search: _Search,
     ) -> RelativePose | Failure:
         """Track expected corners, measure in 3-D, register; velocities stay as they are."""
         measured = self._track(reference, current, expected, search)
-        return self._calibrated.register(measured, self._config, prior=prior, is_step=False)
+        return self.calibrated.register(measured, self._config, prior=prior, is_step=False)
 
     def _sigmas(self, n: int) -> tuple[FloatArray, FloatArray]:
         """Return the sigmas of (u, v, disparity) of corners and of their tracks."""
@@ -407,27 +416,14 @@ class KltFrontend:
         self,
         reference: _Reference,
         current: KltObservations,
-        expected: _Expected,
+        expected: Expected,
         search: _Search,
     ) -> Measurements:
         """Find expected corners in the current frame, and measure them there."""
-        pixels, is_tracked = self._find_tracks(reference, current, expected, search)
-        note(
-            "attempt",
-            method="tracks",
-            prior=expected.T_reference_current,
-            is_wide=search == "wide",
-            radius_px=float(WINDOW_RADIUS_PX),
-            source_uvd=reference.uvd,
-            indices=expected.indices,
-            predicted=expected.uvd,
-            pixels=pixels,
-            is_tracked=is_tracked,
-        )
+        pixels, is_tracked = self.find_tracks(reference, current, expected, search)
         tracked = np.flatnonzero(is_tracked)
         pixels, expected = pixels.take(tracked, axis=0), expected.take(tracked)
         disparities, is_valid = self._measure(current.frame, pixels, expected, search)
-        note("klt.measured", pixels=pixels, disparities=disparities, is_valid=is_valid)
         valid = np.flatnonzero(is_valid)
         indices = expected.indices.take(valid)
         target_uvd = np.column_stack([pixels, disparities]).take(valid, axis=0)
@@ -439,16 +435,16 @@ class KltFrontend:
             sigma_factor=KLT_SIGMA_FACTOR,
         )
 
-    def _predict(
+    def predict(
         self, T_reference_current: FloatArray, reference: _Reference, current: KltObservations
-    ) -> _Expected:
+    ) -> Expected:
         """Return the corners that are in view of the current camera after a motion."""
-        settled = self._calibrated.correct(reference, reference.uvd)
+        settled = self.calibrated.correct(reference, reference.uvd)
         points = self.camera.unproject_stereo(settled[:, :2], settled[:, 2])
         T_current_reference = se3.invert(T_reference_current)
         points = se3.transform_points(T_current_reference, points)
         in_front = np.flatnonzero(points[:, 2] > _MIN_DEPTH_M)
-        seen = self._calibrated.distort(current, self.camera.project_stereo(points[in_front]))
+        seen = self.calibrated.distort(current, self.camera.project_stereo(points[in_front]))
         in_view = np.flatnonzero(self.camera.is_in_view(seen[:, :2]))
         indices = in_front.take(in_view)
         offset = np.array([0.0, 0.0, self.rig_offsets.disparity_px])
@@ -459,7 +455,7 @@ class KltFrontend:
             T_current_reference,
             self.camera,
         )
-        return _Expected(
+        return Expected(
             T_reference_current=T_reference_current,
             indices=indices,
             uvd=seen.take(in_view, axis=0),
@@ -467,11 +463,11 @@ class KltFrontend:
             slopes=move_slopes(*surfaces) if self._is_stereo else slopes,
         )
 
-    def _find_tracks(
+    def find_tracks(
         self,
         reference: _Reference,
         current: KltObservations,
-        expected: _Expected,
+        expected: Expected,
         search: _Search,
     ) -> tuple[FloatArray, BoolArray]:
         """Return the pixels of expected corners in the current image, and which are found.
@@ -500,7 +496,7 @@ class KltFrontend:
         self,
         reference: _Reference,
         current: KltObservations,
-        expected: _Expected,
+        expected: Expected,
         start: FloatArray,
     ) -> tuple[FloatArray, BoolArray]:
         templates = reference.templates.take(expected.indices)
@@ -508,7 +504,7 @@ class KltFrontend:
         return pixels, is_found & self.camera.is_in_view(pixels)
 
     def _measure(
-        self, frame: Frame, pixels: FloatArray, expected: _Expected, search: _Search
+        self, frame: Frame, pixels: FloatArray, expected: Expected, search: _Search
     ) -> tuple[FloatArray, BoolArray]:
         """Measure the disparities of tracks, virtual ones of RGB-D."""
         if isinstance(frame, RgbdFrame):
@@ -520,7 +516,6 @@ class KltFrontend:
         disparities, is_valid = measure(
             images, pixels, expected.uvd[:, 2], config, row_offset_px=row_offset_px
         )
-        note("klt.followed", disparities=disparities, is_at_rest=is_valid)
         return disparities, is_valid & self._is_in_range(disparities, offset_px)
 
     def _is_in_range(self, disparities: FloatArray, offset_px: float) -> BoolArray:
@@ -563,7 +558,7 @@ class KltCorners:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Expected:
+class Expected:
     """The corners of a reference that a motion brings into view of another frame.
 
     Parameters
@@ -586,9 +581,9 @@ class _Expected:
     warps: FloatArray
     slopes: FloatArray
 
-    def take(self, chosen: IntArray) -> _Expected:
+    def take(self, chosen: IntArray) -> Expected:
         """Select corners by index."""
-        return _Expected(
+        return Expected(
             T_reference_current=self.T_reference_current,
             indices=self.indices.take(chosen),
             uvd=self.uvd.take(chosen, axis=0),

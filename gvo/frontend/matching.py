@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gvo._trace import note
 from gvo.config import StereoConfig, TemporalConfig
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
@@ -160,6 +159,21 @@ def predict_pixels(
     return camera.project(points[indices]), indices
 
 
+def compare_within(
+    reference: Observations,
+    current: Observations,
+    predicted: tuple[FloatArray, IntArray],
+    radius_px: float,
+) -> tuple[IntArray, FloatArray]:
+    """Return the pairs of two frames within a radius of the prediction, and their distances."""
+    pixels, indices = predicted
+    if len(indices) == 0 or len(current) == 0:
+        return np.zeros((0, 2), dtype=np.int64), np.zeros(0)
+    near = _pairs_within(pixels, current.keypoints, radius_px)
+    pairs = np.stack([indices[near[:, 0]], near[:, 1]], axis=1)
+    return pairs, _mean_distances(reference, current, pairs)
+
+
 def match_temporal(
     reference: Observations,
     current: Observations,
@@ -185,13 +199,7 @@ def match_temporal(
     ndarray of int64, shape (m, 2)
         Indices into reference and current, each at most once.
     """
-    pixels, indices = predicted
-    if len(indices) == 0 or len(current) == 0:
-        return np.zeros((0, 2), dtype=np.int64)
-    pairs = _pairs_within(pixels, current.keypoints, radius_px)
-    pairs = np.stack([indices[pairs[:, 0]], pairs[:, 1]], axis=1)
-    distances = _mean_distances(reference, current, pairs)
-    note("temporal.candidates", pairs=pairs, distances=distances)
+    pairs, distances = compare_within(reference, current, predicted, radius_px)
     return select_matches(pairs, distances, config, (len(reference), len(current)))
 
 

@@ -7,7 +7,6 @@ from typing import Any, Generic, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import numpy as np
 
-from gvo._trace import note
 from gvo.config import Config
 from gvo.frontend.calibration import RigOffsets
 from gvo.geometry import se3
@@ -184,10 +183,7 @@ class CheckedFrontend(Generic[ObservationsT]):
         ValueError
             When the front-end returns neither RelativePose nor Failure.
         """
-        note("frontend.begin", reference=reference)
-        result = self._checked("register", self._frontend.register(reference, current, prior))
-        note("frontend.end", result=result)
-        return result
+        return self._checked("register", self._frontend.register(reference, current, prior))
 
     def align_depth(
         self, reference: ObservationsT, current: ObservationsT, T_reference_current: FloatArray

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gvo._trace import note
 from gvo.config import Config
 from gvo.frontend.matching import mutual_best
 from gvo.frontend.verification import verify_motion
@@ -96,13 +95,9 @@ def register_correspondences(
     -------
     RelativePose or Failure
     """
-    given = {"correspondences": correspondences, "matches": matches, "stamps_ns": stamps_ns}
-    note("registration.begin", **given)
     if prior is not None and T_start is None:
         T_start = se3.invert(prior.T_predicted)
-    known = _known_consensus(T_start, correspondences, camera, config)
-    consensus = known or search_consensus(correspondences, camera, config, stamps_ns)
-    note("registration.consensus", consensus=consensus, is_known=known is not None)
+    consensus = find_consensus(correspondences, camera, config, stamps_ns, T_start)
     if isinstance(consensus, Failure):
         return consensus
     refined = _refine(consensus, correspondences, camera, config)
@@ -112,7 +107,6 @@ def register_correspondences(
             prior=prior,
             make_rng=partial(_rng, config, stamps_ns),
         )
-        note("registration.verified", refined=refined)
     return _conclude(refined, consensus, correspondences, matches, config.ransac.min_inliers)
 
 
@@ -129,14 +123,28 @@ def estimate_roughly(
     wide = {name: _ROUGH_FACTOR * getattr(config.ransac, name) for name in thresholds}
     config = config.model_copy(update={"ransac": config.ransac.model_copy(update=wide)})
     T = None if prior is None else se3.invert(prior.T_predicted)
-    known = _known_consensus(T, correspondences, camera, config)
-    found = known or search_consensus(correspondences, camera, config, stamps_ns)
+    found = find_consensus(correspondences, camera, config, stamps_ns, T)
     if isinstance(found, Failure):
         return found
     T, huber = found.T_target_source, config.registration.huber
     residuals = StereoResiduals.of(T, correspondences, camera, huber=huber)
     refined = descend(T, residuals.select(found.inliers), n_iterations=_N_ROUGH_ITERATIONS)
     return T if refined is None else refined
+
+
+def find_consensus(
+    correspondences: Correspondences,
+    camera: StereoCamera,
+    config: Config,
+    stamps_ns: tuple[int, int],
+    T_start: FloatArray | None,
+) -> Consensus | Failure:
+    """Return the start value if most matches agree with it, else what RANSAC finds.
+
+    Arguments are those of `register_correspondences`; the start is a T_target_source.
+    """
+    known = _known_consensus(T_start, correspondences, camera, config)
+    return known or _search_consensus(correspondences, camera, config, stamps_ns)
 
 
 def _known_consensus(
@@ -147,7 +155,6 @@ def _known_consensus(
         return None
     inliers = find_inliers(T[np.newaxis], correspondences, camera, config.ransac)[0]
     n_needed = max(config.ransac.min_inliers, _MIN_KNOWN_SHARE * len(correspondences))
-    note("registration.known", inliers=inliers, n_needed=n_needed)
     if np.count_nonzero(inliers) < n_needed:
         return None
     return Consensus(T_target_source=T, inliers=inliers)
@@ -157,11 +164,9 @@ def _refine(
     consensus: Consensus, correspondences: Correspondences, camera: StereoCamera, config: Config
 ) -> Refinement | Failure:
     registration = config.registration
-    refined = (fit_covariance if registration.refine == "none" else refine_pose)(
+    return (fit_covariance if registration.refine == "none" else refine_pose)(
         consensus.T_target_source, correspondences, consensus.inliers, camera, registration
     )
-    note("registration.refined", refined=refined)
-    return refined
 
 
 def _conclude(
@@ -186,7 +191,7 @@ def _conclude(
     )
 
 
-def search_consensus(
+def _search_consensus(
     correspondences: Correspondences,
     camera: StereoCamera,
     config: Config,

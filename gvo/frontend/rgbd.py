@@ -6,7 +6,6 @@ from functools import lru_cache
 
 import numpy as np
 
-from gvo._trace import note
 from gvo.config import DepthConfig
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
@@ -80,7 +79,6 @@ def sample_depth(
     # Beside a hole or the border the plane continues, but not beyond all that was seen.
     fitted = np.clip(fitted, lowest[chosen], highest[chosen])
     depths[chosen] = np.where(is_fitted, fitted, depths[chosen])
-    note("depth.sampled", pixels=keypoints, depths=depths, is_valid=is_valid)
     return depths, is_valid
 
 
@@ -166,7 +164,6 @@ def check_depths(
     # Nearer than expected is hidden, and says nothing; farther is seen through.
     n_pierced = int(np.count_nonzero(differences < -_GATE))
     n = n_agreeing + n_pierced
-    note("registration.depths", n_agreeing=n_agreeing, n_pierced=n_pierced)
     if len(differences) < _MIN_POINTS or n_agreeing >= _MIN_AGREEING * n:
         return result
     return Contradiction(

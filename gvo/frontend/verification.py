@@ -25,7 +25,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gvo._trace import note
 from gvo.config import Config, RegistrationConfig
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
@@ -170,7 +169,6 @@ def _find_other(
     if T_other is None:
         return None
     supporters = misfits & residuals.within(T_other, gate)
-    note("registration.other", T_target_source=T_other, supporters=supporters, n_needed=n_needed)
     return (T_other, supporters) if np.count_nonzero(supporters) >= n_needed else None
 
 
@@ -217,11 +215,6 @@ def _decide(
     first: _Group, second: _Group, *, apart_px: float, n_needed: float
 ) -> Refinement | Failure:
     """Return the motion that the prediction speaks for, or a failure where it does for none."""
-    note(
-        "registration.two_motions",
-        n_fitting=(first.n_fitting, second.n_fitting),
-        surprises_px=(first.surprise_px, second.surprise_px),
-    )
     if np.count_nonzero(first.fitting & ~second.fitting) < n_needed:
         # What was found first was a compromise: hardly anything fits it alone.
         return max(second, first, key=lambda group: group.n_fitting).refined
@@ -268,7 +261,6 @@ def _prefer_recent_motion(found: Refinement, problem: _Problem, T_recent: FloatA
     if T_other is None:
         return found
     supporters = misfits & found.residuals.within(T_other, gate)
-    note("registration.recent", T_target_source=T_other, supporters=supporters, gate=gate)
     is_enough = np.count_nonzero(supporters) >= problem.n_needed
     if not (is_enough and _is_continued(T_other, found.T_target_source, T_recent, problem)):
         return found

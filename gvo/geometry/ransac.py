@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gvo._trace import note
 from gvo.config import RansacConfig
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
@@ -77,7 +76,6 @@ def ransac_rigid(
     # Where the near points lie on a line, the far ones may not.
     for pool in [near] if len(near) == n else [near, np.arange(n)]:
         samples = pool[draw_samples(len(pool), config.n_hypotheses, rng)]
-        note("ransac.samples", samples=samples, near=pool)
         best = _search(samples, correspondences, camera, config, near=pool)
         if best is not None:
             return _refit(best, correspondences, camera, config, near=pool, weights=weights)
@@ -108,7 +106,6 @@ def _search(
             best = found
         # Samples are drawn from near points: their inlier ratio decides.
         share = np.count_nonzero(best[near]) / len(near)
-        note("ransac.block", n_before=n_before, is_valid=is_valid, counts=counts, share=share)
         if (1.0 - share**3) ** (n_before + len(block)) < _MISS_PROBABILITY:
             break
     return best

@@ -28,7 +28,6 @@ import cv2
 import numpy as np
 from scipy.linalg.lapack import dposv
 
-from gvo._trace import note
 from gvo.config import RegistrationConfig
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
@@ -122,7 +121,6 @@ def refine_pose(
         A failure if a direction of motion is unobservable.
     """
     residuals = StereoResiduals.of(T_target_source, matches, camera, huber=config.huber)
-    note("refinement.begin", residuals=residuals)
     # Unobservable directions may give steps that are not finite; they are checked.
     with np.errstate(over="ignore", invalid="ignore"):
         rough = _gauss_newton(
@@ -133,7 +131,6 @@ def refine_pose(
         chosen = residuals.within(rough, config.gate)
         if np.count_nonzero(chosen) < np.count_nonzero(inliers) // 2:
             chosen = inliers
-        note("refinement.gated", T_target_source=rough, inliers=chosen)
         every, residuals = residuals, residuals.select(chosen)
         T = _gauss_newton(rough, residuals, n_iterations=_N_ITERATIONS)
         if isinstance(T, Failure):
@@ -244,7 +241,6 @@ def fit_covariance(
     Parameters and results are those of `refine_pose`; pose and inliers stay as they are.
     """
     residuals = StereoResiduals.of(T_target_source, matches, camera, huber=config.huber)
-    note("refinement.begin", residuals=residuals)
     return _with_covariance(T_target_source, residuals.select(inliers), (inliers, residuals))
 
 
@@ -264,7 +260,6 @@ def _gauss_newton(
             return Failure(reason=_OPEN)
         # Not the exponential map but a retraction: the same to first order, and cheap.
         T = se3.make_transform(cv2.Rodrigues(step[:3])[0], step[3:]) @ T
-        note("refinement.step", T_target_source=T, step=step)
         gain = step @ at.g
         if gain < _CONVERGED:
             break

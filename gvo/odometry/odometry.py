@@ -11,7 +11,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from gvo._trace import note
 from gvo.backend.keyframe_policy import choose_unseen, is_needed
 from gvo.backend.window import SlidingWindow
 from gvo.config import Config
@@ -333,7 +332,6 @@ class Odometry:
         self, observations: _Observations, step: RawStep
     ) -> tuple[dict[int, float], list[_Offer]]:
         """Return the keyframes' scores, and edges to the predecessor and to keyframes."""
-        note("odometry.step", step=step)
         # A coasted step is no measurement: the window predicts by itself.
         offered: list[_Offer] = []
         if step.registration is not None:
@@ -342,7 +340,6 @@ class Odometry:
             return {}, offered
         T_frame_keyframes = self._predict_keyframes(step)
         scores = self._keyframes.scores(T_frame_keyframes)
-        note("odometry.scores", scores=scores)
         self._keyframes.note_seen(scores, step.n_steps)
         measure = partial(self._register_keyframe, observations, step)
         config = self._config.window

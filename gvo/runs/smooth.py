@@ -34,7 +34,6 @@ from gvo.trajectory.evaluation import Evaluation, evaluate, evaluations_json
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Edge, Estimate, FrameId, PositionPrior, Progress, Rejected, Status
-from gvo.viz.plots import plot_trajectories
 
 POSES_HEADER = ("stamp_ns", "frame_id", "status", "n_edges", "n_rejected", "reason")
 """Columns of `frames.csv` in the folder of smoothed edges."""
@@ -285,6 +284,9 @@ def _written(
         folder.write_summary(summary)
         if on_written is not None:
             on_written()
+        # Matplotlib takes a third of a second to load.
+        from gvo.viz.plots import plot_trajectories
+
         plot_trajectories(folder.path / PICTURE, truth if evaluations else None, estimates)
     is_complete &= not (notes.broken_off or notes.warnings)
     return RunResult(

@@ -13,9 +13,9 @@ import pytest
 import gvo
 from gvo.frontend.klt import KltFrontend
 from gvo.io.bag.reader import BagMessage
-from gvo.runs import smooth
 from gvo.runs.smooth import Smoother
 from gvo.trajectory import evaluation
+from gvo.viz import plots
 from gvo.viz.report import run as report
 from tests.conftest import Command, line_of_poses
 
@@ -116,8 +116,8 @@ def test_a_signal_while_the_report_is_drawn_leaves_the_whole_run(
 @pytest.mark.parametrize(
     "case",
     [
-        (smooth, "plot_trajectories", ("smooth", "{poses}")),
-        (smooth, "plot_trajectories", ("smooth", "{poses}", "--window")),
+        (plots, "plot_trajectories", ("smooth", "{poses}")),
+        (plots, "plot_trajectories", ("smooth", "{poses}", "--window")),
     ],
     ids=["optimized", "window"],
 )

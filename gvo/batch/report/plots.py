@@ -17,10 +17,9 @@ from gvo._text import number_text, visible
 from gvo.batch.effects import COUNTS, ERROR, MIN_RUNS, TIME, relative, span, value_medians
 from gvo.batch.report.values import N_LABEL, Batch, logarithmic_axis, shown, value_text
 from gvo.types import BoolArray, FloatArray
+from gvo.viz.figures import Plot, evenly, legend_above, new_figure
+from gvo.viz.pages import part
 from gvo.viz.palette import ESTIMATES, REFUSED
-from gvo.viz.plots import evenly
-from gvo.viz.report.page import table_html
-from gvo.viz.report.sheets import WIDE, Plot, arrange
 
 MAX_ROWS = 30
 """Of more only the best and the worst are drawn."""
@@ -186,7 +185,7 @@ def _capped(
 
 
 def _figure(rows: Sequence[_Row], panels: Sequence[_Panel]) -> Figure:
-    figure = Figure(figsize=(WIDE, 0.75 + 0.24 * max(len(rows), 2)))
+    figure = new_figure(0.75 + 0.24 * max(len(rows), 2))
     many: Any = figure.subplots(1, len(panels), sharey=True, squeeze=False)
     for axes, panel in zip(many[0], panels, strict=True):
         for y, row in enumerate(rows):
@@ -199,9 +198,6 @@ def _figure(rows: Sequence[_Row], panels: Sequence[_Panel]) -> Figure:
         label.set_fontweight("bold" if row.is_marked else "normal")
         if not np.any(row.is_in):
             label.set_color(_GREY)
-    n_longest = max((1.2 if row.is_marked else 1.0) * len(row.name) for row in rows)
-    arrange(figure, left=0.3 + 0.066 * max(n_longest, 8.0))
-    figure.subplots_adjust(wspace=0.1)
     return figure
 
 
@@ -262,7 +258,7 @@ def effect_sheets(batch: Batch) -> list[tuple[Plot, str]]:
     if not effects:
         return []
     kinds = ["error", "time"] if batch.has_errors else ["time"]
-    tables = [""] * (len(kinds) - 1) + [table_html(_VALUES_HEADER, _value_rows(effects))]
+    tables = [""] * (len(kinds) - 1) + [part("table", _VALUES_HEADER, _value_rows(effects))]
     return [(_values_plot(effects, kind), table) for kind, table in zip(kinds, tables, strict=True)]
 
 
@@ -290,7 +286,7 @@ def _values_plot(effects: Mapping[str, pd.DataFrame], kind: str) -> Plot:
 def _values_figure(told: Mapping[str, pd.DataFrame], kind: str) -> Figure:
     n_columns = min(_N_COLUMNS, max(len(told), 2))
     n_rows = -(-len(told) // n_columns)
-    figure = Figure(figsize=(WIDE, 0.6 + 2.2 * n_rows))
+    figure = new_figure(0.6 + 2.2 * n_rows)
     panels: Any = figure.subplots(n_rows, n_columns, sharey=True, squeeze=False)
     for axes, (name, effect) in zip(panels.flat, told.items(), strict=False):
         _draw_values(axes, effect, kind, _N_LETTERS // n_columns)
@@ -304,8 +300,6 @@ def _values_figure(told: Mapping[str, pd.DataFrame], kind: str) -> Figure:
     for row in panels:
         logarithmic_axis(row[0], "y", ends=(low, high), n_ticks=9)
         row[0].set_ylabel(f"{kind} over the median [-]")
-    arrange(figure)
-    figure.subplots_adjust(wspace=0.08, hspace=0.35, top=1.0 - 0.3 / (0.6 + 2.2 * n_rows))
     return figure
 
 
@@ -373,7 +367,7 @@ def front_sheet(batch: Batch) -> tuple[Plot, str]:
         ]
         for number, (name, mean) in enumerate(front.iterrows(), start=1)
     ]
-    return plot, table_html(_FRONT_HEADER, rows)
+    return plot, part("table", _FRONT_HEADER, rows)
 
 
 def _front_words(batch: Batch, placed: pd.DataFrame) -> str:
@@ -399,7 +393,7 @@ def _front_words(batch: Batch, placed: pd.DataFrame) -> str:
 
 
 def _front_figure(batch: Batch, placed: pd.DataFrame, front: pd.DataFrame) -> Figure:
-    figure = Figure(figsize=(WIDE, 4.6))
+    figure = new_figure(4.6)
     axes = figure.subplots()
     is_candidate, is_on_front = placed["is_candidate"], placed["is_on_front"]
     _draw(axes, placed[~is_candidate], "incomplete", color=_GREY, mfc="none")
@@ -417,8 +411,7 @@ def _front_figure(batch: Batch, placed: pd.DataFrame, front: pd.DataFrame) -> Fi
     logarithmic_axis(axes, "x", ends=(left, right), n_ticks=8)
     logarithmic_axis(axes, "y", ends=(low, high), n_ticks=8)
     axes.set(xlabel="time over the mean [-]", ylabel="error over the mean [-]")
-    arrange(figure, axes)
-    figure.subplots_adjust(right=0.66)
+    legend_above(figure, axes)
     _write_names(axes, [shown(batch.labels[name], N_LABEL) for name in front.index])
     return figure
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from urllib.parse import quote, urlsplit
 
 import numpy as np
+from markupsafe import Markup
 
 from gvo._text import html_text, number_text, visible
 from gvo.batch.effects import ERROR, relative, swept
@@ -19,8 +20,8 @@ from gvo.batch.report.values import Batch
 from gvo.batch.tasks import BatchRow
 from gvo.io.run_folder.writer import REPORT
 from gvo.types import FloatArray
-from gvo.viz.report.page import facts_html, list_html, plots_html, write_page
-from gvo.viz.report.sheets import settings, write_plots
+from gvo.viz.figures import style, write_plots
+from gvo.viz.pages import part, write_page
 
 _MAX_LISTED = 20
 _SCHEMES = ("http", "https")
@@ -71,7 +72,7 @@ def write_batch_report(
     if not rows:
         raise ValueError("expected at least one row")
     batch = Batch(rows)
-    with settings(), warnings.catch_warnings():
+    with style(), warnings.catch_warnings():
         # the page takes its fonts from the reader's machine
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         sheets = [(box_plot(batch), ""), *effect_sheets(batch)]
@@ -80,10 +81,10 @@ def write_batch_report(
         # Each plot with the table below it.
         body = [
             *_head(batch, title, note),
-            *(part for plot, table in sheets for part in (*plots_html([plot]), table)),
+            *(each for plot, table in sheets for each in (part("section", plot), table)),
             _runs_html(batch, path.parent),
         ]
-        write_page(path, title, body)
+        write_page(path, "batch.html", title=title, parts=map(Markup, body))
         if plots is not None:
             write_plots([plot for plot, _ in sheets], plots)
 
@@ -92,8 +93,8 @@ def _head(batch: Batch, title: str, note: str) -> list[str]:
     parts = [
         f"<h1>{html_text(title)}</h1>",
         f"<p>{html_text(note)}</p>" if note else "",
-        list_html("Failed", _failures(batch), kind="warnings"),
-        facts_html(_facts(batch)),
+        part("listed", "Failed", _failures(batch), "warnings"),
+        part("facts", _facts(batch)),
         '<p class="note"><a href="#runs">All runs, the worst first</a></p>',
     ]
     return [part for part in parts if part]

@@ -18,7 +18,7 @@ from gvo.batch.results import to_frame
 from gvo.batch.tasks import BatchRow
 from gvo.config import Config
 from gvo.types import BoolArray, FloatArray
-from gvo.viz.plots import plain
+from gvo.viz.figures import plain
 
 N_LABEL = 40
 """Letters of a name in a picture."""

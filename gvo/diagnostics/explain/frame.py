@@ -2,21 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
+from typing import Any
 
-from gvo._trace import Trace, watched
 from gvo.config import Config
-from gvo.diagnostics.explain import steps
-from gvo.diagnostics.explain.steps import Registration, describe, registrations_of
-from gvo.diagnostics.explain.values import FrameExplanation, Step
+from gvo.diagnostics.explain.extraction import explain_disparity, explain_measured, explain_track
+from gvo.diagnostics.explain.motion import Asked, OwnFrontend, explain_registration
+from gvo.diagnostics.explain.values import Corner, FrameExplanation, Link, Registration, Sorting
 from gvo.errors import RecordingError
-from gvo.frontend.descriptor import as_stereo
-from gvo.frontend.klt import image_of
+from gvo.frontend.descriptor import is_step
+from gvo.frontend.factory import make_frontend
+from gvo.frontend.klt import KltFrontend, image_of
+from gvo.geometry import se3
 from gvo.io.excerpt import Excerpt
 from gvo.io.frames import frames
 from gvo.io.recording import Source
+from gvo.odometry.keyframes import view_overlap
 from gvo.odometry.odometry import Odometry
-from gvo.types import Failure, FaultyFrame, Frame, FrameResult, Progress, RelativePose, Status
+from gvo.types import (
+    Failure,
+    FaultyFrame,
+    Frame,
+    FrameResult,
+    MotionPrior,
+    Progress,
+    RelativePose,
+    Status,
+    StereoFrame,
+)
 
 
 def explain_frame(
@@ -77,15 +90,39 @@ def explain_frame(
     )
 
 
+class _Watched:
+    """A front-end that keeps what it was asked to register."""
+
+    def __init__(self, frontend: OwnFrontend) -> None:
+        self.own = frontend
+        self.asked: list[Asked] = []
+        self.extracted: dict[int, Any] = {}
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - whatever else a front-end offers
+        return getattr(self.own, name)
+
+    def extract(self, frame: Frame) -> Any:  # noqa: ANN401 - the front-end's own observations
+        self.extracted[frame.stamp_ns] = self.own.extract(frame)
+        return self.extracted[frame.stamp_ns]
+
+    def register(
+        self,
+        reference: Any,  # noqa: ANN401
+        current: Any,  # noqa: ANN401
+        prior: MotionPrior | None,
+    ) -> RelativePose | Failure:
+        result = self.own.register(reference, current, prior)
+        self.asked.append(Asked(reference, current, prior, result))
+        return result
+
+
 class _Drive:
-    """Odometry that keeps the frames which the next one may be registered against."""
+    """Odometry that keeps the frames which the next one may be registered with."""
 
     def __init__(self, source: Source, config: Config) -> None:
-        # Only this thread is watched; results do not depend on the number of threads.
-        runtime = config.runtime.model_copy(update={"threads": 1})
-        watchable = config.model_copy(update={"runtime": runtime})
-        self._odometry = Odometry(source.info.camera, watchable)
-        self._camera = as_stereo(source.info.camera)
+        camera = source.info.camera
+        self._frontend = _Watched(make_frontend(camera, config))
+        self._odometry = Odometry(camera, config, frontend=self._frontend)
         self._name, self._config = source.info.name, config
         self._frames: dict[int, Frame] = {}
         self._indices: dict[int, int] = {}
@@ -93,88 +130,113 @@ class _Drive:
 
     def track(self, frame: Frame, index: int) -> FrameResult:
         """Track a frame as a run does."""
+        self._frontend.asked.clear()
         result = self._odometry.track(frame)
         if result.registration is not None or self._anchor_ns is None:
             self._anchor_ns = frame.stamp_ns
         held = {**self._frames, frame.stamp_ns: frame}
         needed = {frame.stamp_ns, self._anchor_ns, *result.keyframes_ns}
+        extracted = self._frontend.extracted
+        self._frontend.extracted = {ns: extracted[ns] for ns in extracted if ns in needed}
         self._frames = {ns: held[ns] for ns in held if ns in needed}
         self._indices[frame.stamp_ns] = index
         return result
 
     def explain(self, frame: Frame, index: int) -> FrameExplanation:
-        """Track a frame and tell what happened with it."""
-        with watched() as trace:
-            result = self._odometry.track(frame)
-        config, offsets = self._config, trace.find("rig.offsets")
-        row_px = offsets.get("row_px", 0.0)
-        measured = steps.explain_measured(trace, config, row_px)
-        n_chain = len(chain := registrations_of(trace.before("odometry.step")))
-        reference_ns = chain[-1].reference_ns if chain else None
-        tried = chain[-1].attempts if chain else []
-        last = tried[-1] if tried else Trace()
-        scores = trace.find("odometry.scores").get("scores", {})
+        """Track a frame, then repeat its steps one by one."""
+        before, extracted = {**self._frames}, {**self._frontend.extracted}
+        result = self.track(frame, index)
+        self._frontend.extracted |= extracted
+        own, config = self._frontend.own, self._config
+        asked = [*self._frontend.asked]
+        offsets = own.rig_offsets
+        measured = explain_measured(frame, own.camera, config, offsets)
+        steps = [each for each in asked if is_step(each.prior)]
+        links = tuple(self._links(asked, result, before))
+        reference_ns = steps[-1].reference.stamp_ns if steps else None
+        reference = None if reference_ns is None else before[reference_ns]
+        registration, attempts = None, ()
+        if steps:
+            registration, attempts = explain_registration(own, steps[-1], own.camera, config)
         return FrameExplanation(
             recording=self._name,
             index=index,
             config=config,
-            camera=self._camera,
+            camera=own.camera,
             frame=frame,
-            reference=None if reference_ns is None else self._frames[reference_ns],
+            reference=reference,
             reference_index=None if reference_ns is None else self._indices[reference_ns],
             result=result,
-            offset_px=offsets.get("disparity_px", 0.0),
-            row_offset_px=row_px,
-            readout_ms=offsets.get("readout_ms", 0.0),
-            row_motion_px=steps.explain_rows(last),
-            keypoints=steps.explain_keypoints(trace),
+            offset_px=offsets.disparity_px,
+            row_offset_px=offsets.row.value,
+            readout_ms=1e3 * offsets.readout_s,
             measured=measured,
-            depth_pixels=steps.explain_depth_pixels(frame, config.depth),
-            subpixel=steps.explain_subpixel(trace, frame, measured, config.stereo, row_px),
-            matches=steps.explain_matches(last, config),
-            consensus=steps.explain_consensus(last, self._camera, config),
-            refinement=steps.explain_refinement(last, self._camera, config),
-            attempt=last,
-            attempts=tuple(line for each in chain for line in describe(each, self._indices)),
-            links=tuple(self._links(registrations_of(trace)[n_chain:], scores, result)),
+            corner=self._corner(frame, reference, measured, registration),
+            registration=registration,
+            attempts=attempts,
+            links=links,
         )
 
+    def _corner(
+        self,
+        frame: Frame,
+        reference: Frame | None,
+        measured: Sorting,
+        registration: Registration | None,
+    ) -> Corner | None:
+        own, config = self._frontend.own, self._config
+        if not isinstance(own, KltFrontend):
+            return None
+        if isinstance(frame, StereoFrame):
+            return explain_disparity(frame, own.camera, measured, config)
+        if reference is None or registration is None:
+            return None
+        matches, inliers = registration.matches, registration.inliers
+        return explain_track((reference, frame), matches, inliers, config)
+
     def _links(
-        self, tried: Sequence[Registration], scores: Mapping[int, float], result: FrameResult
-    ) -> Iterator[Step]:
-        """Tell what each earlier frame contributed."""
-        registrations = {each.reference_ns: each.result for each in tried}
-        keyframes = {link.reference_ns: link for link in result.links if link.kind == "keyframe"}
-        before = [link for link in result.links if link.kind == "step"]
-        others = sorted({*scores} - {link.reference_ns for link in before} | {*registrations})
+        self, asked: list[Asked], result: FrameResult, frames: dict[int, Frame]
+    ) -> Iterator[Link]:
+        """Yield what each earlier frame contributed."""
+        registered = {each.reference.stamp_ns: each for each in asked}
+        edges = {link.reference_ns: link for link in reversed(result.links)}
+        known = sorted({*result.keyframes_ns, *edges} & {*frames})
+        steps_ns = [link.reference_ns for link in result.links if link.kind == "step"]
         refusals = {each.reference_id: each.reason for each in reversed(result.causal.rejected)}
-        for ns, link, registration in [
-            *((link.reference_ns, link, result.registration) for link in before),
-            *((ns, keyframes.get(ns), registrations.get(ns)) for ns in others),
-            *((link.reference_ns, link, None) for link in result.links if link.kind == "depth"),
-        ]:
-            is_accepted = link is not None and link.is_accepted
-            unused = "keyframe" if registration is not None else "not linked"
-            reason = refusals.get(ns, "not taken by the window")
-            if link is None:
-                reason = self._why_unlinked(registration, scores.get(ns, 0.0))
-            yield Step(
+        for ns in sorted(known, key=lambda ns: ns not in steps_ns):
+            edge = edges.get(ns)
+            answer = registered[ns].result if ns in registered else None
+            overlap = self._overlap(ns, result)
+            reason = refusals.get(ns, "the window did not take it")
+            if edge is None:
+                reason = self._why_unlinked(answer, overlap)
+            is_accepted = edge is not None and edge.is_accepted
+            unused = "not linked" if answer is None else "keyframe"
+            yield Link(
                 frame=self._indices[ns],
                 stamp_ns=ns,
-                kind=unused if link is None else link.kind,
-                overlap=scores.get(ns),
-                chi2=None if link is None else link.chi2,
+                image=image_of(frames[ns]),
+                kind=unused if edge is None else edge.kind,
+                overlap=overlap,
+                chi2=None if edge is None else edge.chi2,
                 is_accepted=is_accepted,
                 reason="" if is_accepted else reason,
-                n_matches=0 if registration is None else registration.n_matches,
-                n_inliers=0 if registration is None else registration.n_inliers,
-                drawn=Step(image=image_of(self._frames[ns]), registration=registration),
+                registration=answer,
             )
 
-    def _why_unlinked(self, registration: RelativePose | Failure | None, overlap: float) -> str:
-        if isinstance(registration, Failure):
-            return registration.reason
-        if registration is not None:
+    def _overlap(self, stamp_ns: int, result: FrameResult) -> float:
+        """Return the share of the points of an earlier frame in view, by the poses found."""
+        if stamp_ns not in self._odometry.window:
+            return 0.0
+        T_frame_world = se3.invert(result.causal.T_world_frame)
+        T_frame_earlier = T_frame_world @ self._odometry.window.pose(stamp_ns)
+        points = self._frontend.extracted[stamp_ns].points_cam
+        return view_overlap(points, T_frame_earlier, self._frontend.own.camera)
+
+    def _why_unlinked(self, answer: RelativePose | Failure | None, overlap: float) -> str:
+        if isinstance(answer, Failure):
+            return answer.reason
+        if answer is not None:
             return "another frame must confirm it first"
         if overlap < self._config.window.min_overlap:
             return "too little overlap"

@@ -4,35 +4,36 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import SimpleNamespace
 
 import numpy as np
 
-from gvo._trace import Trace
 from gvo.config import Config
 from gvo.frontend.klt import image_of
 from gvo.geometry.camera import StereoCamera
-from gvo.types import BoolArray, FloatArray, Frame, FrameResult, ImageArray, IntArray
+from gvo.types import (
+    BoolArray,
+    Failure,
+    FloatArray,
+    Frame,
+    FrameResult,
+    ImageArray,
+    IntArray,
+    RelativePose,
+)
 
 KEPT = "kept"
-
-
-class Step(SimpleNamespace):
-    """Values by name, as in `explanation.json`; `drawn` are those that only its picture needs."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sorting:
     """Pixels that were kept, and those dropped with the first test that each failed.
 
-    Arrays are empty where they do not apply.
-
     Parameters
     ----------
     tests : mapping of str to ndarray of bool, shape (n,)
         In order, True for pixels that pass.
     pixels : ndarray of float64, shape (n, 2)
-        (u, v) in the left or colour image; matches: of the reference.
+        (u, v) in the left or colour image; of matches, in that of the reference.
     partners : ndarray of float64, shape (n, 2)
         Pixels found, or the best candidates, in the other image; NaN = none.
     predicted : ndarray of float64, shape (n, 2)
@@ -78,6 +79,101 @@ class Sorting:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Corner:
+    """One corner: its patch in two images, and the correlation along the row of the second.
+
+    The second image is the right one of a stereo pair, or the current one of an RGB-D camera,
+    whose reference is the first.
+
+    Parameters
+    ----------
+    pixel, partner : ndarray of float64, shape (2,)
+        (u, v) in the first and in the second image.
+    patches : ndarray of float32, shape (2, size, size)
+    columns : ndarray of float64, shape (n,)
+        Disparities of a stereo pair; columns less that of the partner for RGB-D.
+    correlations : ndarray of float64, shape (n,)
+        Of the first patch with those of the second image there, -1 to 1.
+    end : float
+        Where among the columns the search ended.
+    """
+
+    pixel: FloatArray
+    partner: FloatArray
+    patches: FloatArray
+    columns: FloatArray
+    correlations: FloatArray
+    end: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Registration:
+    """The last attempt to register the frame with its reference, from matches to motion.
+
+    Parameters
+    ----------
+    matches : Sorting
+        The points of the reference.
+    radius_px : float
+        Half size of the windows tracked, or the radius in which descriptors are compared.
+    is_predicted : bool
+        The search began where a predicted motion shows the points.
+    consensus : int
+        How many matches the refinement began with; 0 where too few agreed.
+    is_known : bool
+        Most matches agreed with the prediction, so that RANSAC was left out.
+    inliers : ndarray of bool, shape (m,)
+        Of the matches kept.
+    residuals_px, whitened : ndarray of float64, shape (2, m, 3), or None
+        (u, v, disparity) measured less predicted, before and after the refinement, in pixels and
+        in sigmas; NaN behind the camera. None where nothing was registered.
+    row_motion_px : float
+        By how much matches were moved at most to the middle of the exposure.
+    """
+
+    matches: Sorting
+    radius_px: float
+    is_predicted: bool
+    consensus: int
+    is_known: bool
+    inliers: BoolArray
+    residuals_px: FloatArray | None
+    whitened: FloatArray | None
+    row_motion_px: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Link:
+    """What an earlier frame contributed.
+
+    Parameters
+    ----------
+    frame, stamp_ns : int
+        Its number and stamp.
+    image : ndarray of uint8, shape (height, width)
+    kind : str
+        Of the edge; "keyframe" or "not linked" where there is none.
+    overlap : float
+        Share of its points that this frame shows.
+    chi2 : float or None
+    is_accepted : bool
+    reason : str
+        Why there is no edge.
+    registration : RelativePose, Failure or None
+    """
+
+    frame: int
+    stamp_ns: int
+    image: ImageArray
+    kind: str
+    overlap: float
+    chi2: float | None
+    is_accepted: bool
+    reason: str
+    registration: RelativePose | Failure | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrameExplanation:
     """One frame from image to pose.
 
@@ -90,31 +186,22 @@ class FrameExplanation:
     camera : StereoCamera
         Of RGB-D with the virtual baseline.
     frame, reference : StereoFrame or RgbdFrame
-        The frame, and the one it was registered against.
+        The frame, and the one it was registered with.
     reference_index : int or None
     result : FrameResult
+        As of `gvo run`, to the last bit.
     offset_px, row_offset_px : float
         Learnt of the rig before: subtracted from disparities, added to rows of the right image.
     readout_ms : float
         Time from the first to the last row that was assumed.
-    row_motion_px : float or None
-        By how much matches were moved at most for it; None where nothing was registered.
-    keypoints : Sorting
     measured : Sorting
         Keypoints with their disparities, or depths of an RGB-D frame.
-    depth_pixels : Sorting or None
-        All pixels of the depth image, row by row; None for stereo.
-    subpixel : Step or None
-        How the disparity of one match was found.
-    matches : Sorting or None
-        Points of the reference; this and what follows are of the last attempt to register.
-    consensus, refinement : Step or None
-        Which matches agree, what the samples of RANSAC found; residuals before and after.
-    attempt : Trace
-        Its events; empty if there was none.
+    corner : Corner or None
+        One of those kept; None for descriptors.
+    registration : Registration or None
     attempts : tuple of str
-        All of them, one a line.
-    links : tuple of Step
+        All attempts to register it, one a line.
+    links : tuple of Link
         What earlier frames contributed: predecessor first, then the keyframes, oldest first.
     """
 
@@ -129,17 +216,11 @@ class FrameExplanation:
     offset_px: float
     row_offset_px: float
     readout_ms: float
-    row_motion_px: float | None
-    keypoints: Sorting
     measured: Sorting
-    depth_pixels: Sorting | None
-    subpixel: Step | None
-    matches: Sorting | None
-    consensus: Step | None
-    refinement: Step | None
-    attempt: Trace
+    corner: Corner | None
+    registration: Registration | None
     attempts: tuple[str, ...]
-    links: tuple[Step, ...]
+    links: tuple[Link, ...]
 
     @property
     def image(self) -> ImageArray:

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from gvo._trace import note
 from gvo.config import StereoConfig
 from gvo.frontend.stereo.disparity import MAX_STEP_PX, Strips, fit_slopes, have_room
 from gvo.frontend.stereo.matching import parabola_vertex
@@ -26,7 +25,7 @@ from gvo.frontend.tracking import halve
 from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 
 # Gauss-Newton steps from the coarse search to the disparity.
-N_SEARCH_STEPS = 6
+_N_SEARCH_STEPS = 6
 # Number of patches that the row offset is measured with.
 _MIN_ROW_SHIFTS = 50
 _MAX_ROW_SHIFTS = 120
@@ -129,9 +128,6 @@ def measure_corners(
     disparities = np.full(len(corners), np.nan)
     disparities[placed] = found[: len(placed)]
     are_reliable = _scatter(is_reliable, placed, len(corners))
-    is_at_rest = _scatter(is_at_rest[: len(placed)], placed, len(corners))
-    searched = {"rough": rough, "is_found": is_found, "is_at_rest": is_at_rest}
-    note("corners.searched", **searched, are_reliable=are_reliable)
     row_shift_px = measure_row_shift(left, right, np.flatnonzero(is_reliable))
     return CornerDisparities(
         disparities=disparities, slopes=slopes, are_reliable=are_reliable, row_shift_px=row_shift_px
@@ -174,7 +170,7 @@ def _search_strips(
         places = np.clip(whole, 0, 2 * (reach_px + 1))
     else:
         patches = Patches.of(left[:, 1:-1]).take(owners)
-        places, is_at_rest = strips.follow(patches, n_steps=N_SEARCH_STEPS)
+        places, is_at_rest = strips.follow(patches, n_steps=_N_SEARCH_STEPS)
     disparities = strips.disparities(places)
     right = sample_patches(right_image, u - disparities, v + row_offset_px, radius, radius)
     return disparities, right, is_at_rest

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from gvo._trace import note
 from gvo.config import StereoConfig
 from gvo.frontend.features import Features
 from gvo.frontend.matching import descriptor_distances, expand_ranges, select_matches
@@ -58,6 +57,15 @@ def _rows(keypoints: FloatArray) -> IntArray:
     return np.asarray(np.floor(keypoints[:, 1] + 0.5).astype(np.int64))
 
 
+def compare_rows(
+    left: Features, right: Features, candidates: IntArray
+) -> tuple[IntArray, FloatArray]:
+    """Return the candidate pairs of about the same octave, and their descriptor distances."""
+    octave_steps = left.octaves[candidates[:, 0]] - right.octaves[candidates[:, 1]]
+    pairs = candidates[np.abs(octave_steps) <= 1]
+    return pairs, descriptor_distances(left.descriptors, right.descriptors, pairs)
+
+
 def match_stereo(
     left: Features, right: Features, camera: StereoCamera, config: StereoConfig
 ) -> IntArray:
@@ -68,11 +76,7 @@ def match_stereo(
     ndarray of int64, shape (m, 2)
         Indices into left and right, each at most once.
     """
-    in_range = pairs = candidate_pairs(left, right, camera, config)
-    octave_steps = left.octaves[pairs[:, 0]] - right.octaves[pairs[:, 1]]
-    pairs = pairs[np.abs(octave_steps) <= 1]
-    distances = descriptor_distances(left.descriptors, right.descriptors, pairs)
-    note("stereo.candidates", in_range=in_range, pairs=pairs, distances=distances)
+    pairs, distances = compare_rows(left, right, candidate_pairs(left, right, camera, config))
     return select_matches(pairs, distances, config, (len(left), len(right)))
 
 

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import json
-from base64 import b64encode
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gvo._text import html_text
-from gvo.diagnostics.explain.steps import has_prior
-from gvo.diagnostics.explain.values import FrameExplanation, Sorting, Step
+from gvo.diagnostics.explain.values import FrameExplanation, Link, Registration, Sorting
 from gvo.errors import ConfigurationError, write_faults
-from gvo.types import ConstantError, StereoFrame
-from gvo.viz.explanation import extraction, motion
-from gvo.viz.explanation.sheet import TITLES, Picture
-from gvo.viz.report.page import write_page
+from gvo.types import ConstantError, Estimate, FloatArray, RelativePose, StereoFrame
+from gvo.viz.explanation.pictures import TITLES, draw_pictures
+from gvo.viz.figures import style
+from gvo.viz.pages import write_page
 
 _RELATIVE = "T_reference_current", "covariance", "n_matches", "n_inliers", "flow_px"
 _ESTIMATE = "status", "T_world_frame", "covariance"
@@ -42,28 +39,31 @@ def write_explanation(explanation: FrameExplanation, out: Path) -> list[Path]:
     ConfigurationError
         When the folder cannot be written to.
     """
-    pictures = draw_pictures(explanation)
-    files = {out / f"{each.name}.png": each.png for each in pictures if each.png is not None}
-    numbers = json.dumps(explanation_json(explanation), indent=2, allow_nan=False, default=_plain)
-    files[out / "explanation.json"] = numbers.encode()
-    with write_faults(ConfigurationError, out):
-        out.mkdir(parents=True, exist_ok=True)
-        for name in TITLES:  # of an earlier explanation, which may have had other steps
-            (out / f"{name}.png").unlink(missing_ok=True)
-        for path, content in files.items():
-            path.write_bytes(content)
-    page, title = out / "explanation.html", f"{explanation.recording}: frame {explanation.index}"
-    opening = f"<h1>{html_text(title)}</h1>\n<p>{html_text(_summary(explanation))}</p>"
-    write_page(page, title, [opening, *map(_section, pictures)])
+    with style():
+        pictures = draw_pictures(explanation)
+        drawn = [each for each in pictures if each.figure is not None]
+        files = {out / f"{each.slug}.png": each.png() for each in drawn}
+        numbers = json.dumps(
+            explanation_json(explanation), indent=2, allow_nan=False, default=_plain
+        )
+        files[out / "explanation.json"] = numbers.encode()
+        with write_faults(ConfigurationError, out):
+            out.mkdir(parents=True, exist_ok=True)
+            for name in TITLES:  # of an earlier explanation, which may have had other steps
+                (out / f"{name}.png").unlink(missing_ok=True)
+            for path, content in files.items():
+                path.write_bytes(content)
+        page = out / "explanation.html"
+        write_page(
+            page,
+            "explanation.html",
+            title=f"{explanation.recording}: frame {explanation.index}",
+            summary=_summary(explanation),
+            attempts=explanation.attempts,
+            plots=pictures,
+            poses=_poses(explanation),
+        )
     return [*files, page]
-
-
-def draw_pictures(explanation: FrameExplanation) -> list[Picture]:
-    """Draw the steps that were reached, in order; say of the others why not."""
-    is_stereo = isinstance(explanation.frame, StereoFrame)
-    of_sensor = extraction.OF_STEREO if is_stereo else extraction.OF_DEPTH
-    drawers = extraction.draw_keypoints, *of_sensor, extraction.draw_histograms, *motion.DRAWERS
-    return [draw(explanation) for draw in drawers]
 
 
 def _summary(explanation: FrameExplanation) -> str:
@@ -78,15 +78,30 @@ def _summary(explanation: FrameExplanation) -> str:
     return f"{text} Not registered: {result.reason}." if result.reason else text
 
 
-def _section(picture: Picture) -> str:
-    """Return a picture, with its caption as text that can be searched and read aloud."""
-    title, image = html_text(picture.title), ""
-    if picture.panels_png is not None:
-        data = b64encode(picture.panels_png).decode()
-        image = f'<div class="panel"><img src="data:image/png;base64,{data}" alt="{title}"></div>\n'
-    caption = "<br>".join(map(html_text, picture.caption.split("\n")))
-    heading = f"{int(picture.name[:2])}. {title}"
-    return f"<section>\n<h2>{heading}</h2>\n{image}<p>{caption}</p>\n</section>"
+def _poses(explanation: FrameExplanation) -> dict[str, str]:
+    """Return the poses found, in words."""
+    result = explanation.result
+    poses = {
+        "Pose by the raw chain": _pose_words(result.raw.T_world_frame, result.raw.covariance),
+        "Pose by the window": _pose_words(result.causal.T_world_frame, result.causal.covariance),
+    }
+    found = result.registration
+    if found is None:
+        return poses
+    name = f"Motion from frame {explanation.reference_index}"
+    return {name: _pose_words(found.T_reference_current, found.covariance), **poses}
+
+
+def _pose_words(T: FloatArray, covariance: FloatArray) -> str:
+    sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    angle = np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
+    position, spread = (
+        ", ".join(f"{each:.4f}" for each in values) for values in (T[:3, 3], sigmas[3:])
+    )
+    return (
+        f"x, y, z = {position} m (sigma {spread}), turned by {angle:.4f} deg "
+        f"(sigma {np.degrees(np.linalg.norm(sigmas[:3])):.4f})"
+    )
 
 
 def explanation_json(explanation: FrameExplanation) -> dict[str, Any]:
@@ -94,9 +109,8 @@ def explanation_json(explanation: FrameExplanation) -> dict[str, Any]:
 
     Steps that were not reached are null. Matrices are lists of rows.
     """
-    result, keypoints = explanation.result, explanation.keypoints
-    measured, is_stereo = _count(explanation.measured), isinstance(explanation.frame, StereoFrame)
-    budget, cell_size_px = extraction.budget_of(explanation.config)
+    result, is_stereo = explanation.result, isinstance(explanation.frame, StereoFrame)
+    measured = _count(explanation.measured)
     return {
         "recording": explanation.recording,
         "frame": explanation.index,
@@ -109,53 +123,62 @@ def explanation_json(explanation: FrameExplanation) -> dict[str, Any]:
         "rig_offset_px": explanation.offset_px,
         "rig_row_offset_px": explanation.row_offset_px,
         "readout_ms": explanation.readout_ms,
-        "row_motion_px": explanation.row_motion_px,
-        "keypoints": {
-            "n_detected": len(keypoints),
-            "n_kept": keypoints.counts()["kept"],
-            "budget": budget,
-            "cell_size_px": cell_size_px,
-        },
         "stereo": measured if is_stereo else None,
         "depth": None if is_stereo else measured,
-        "depth_pixels": _count(explanation.depth_pixels),
-        "subpixel": explanation.subpixel,
-        "matches": _matches(explanation),
-        "consensus": explanation.consensus,
-        "refinement": explanation.refinement,
+        "matches": _matches(explanation.registration),
+        "residuals": _residuals(explanation.registration),
         "relative_pose": _pick(result.registration, *_RELATIVE, "calibration_errors"),
         "raw": _pick(result.raw, *_ESTIMATE),
         "causal": _pick(result.causal, *_ESTIMATE),
-        "links": explanation.links,
+        "links": [_link(each) for each in explanation.links],
         "became_keyframe": explanation.became_keyframe,
+        "stage_ms": result.stage_ms,
         "configuration": explanation.config.model_dump(),
     }
 
 
-def _plain(value: Any) -> Any:  # noqa: ANN401 - steps, and arrays and numbers of NumPy
-    if isinstance(value, Step):
-        return {name: each for name, each in vars(value).items() if name != "drawn"}
+def _plain(value: Any) -> Any:  # noqa: ANN401 - arrays and numbers of NumPy, and constants
     return asdict(value) if isinstance(value, ConstantError) else value.tolist()
 
 
-def _pick(value: object, *names: str) -> dict[str, Any] | None:
+def _pick(value: RelativePose | Estimate | None, *names: str) -> dict[str, Any] | None:
     """Return attributes by name; None of None."""
     return None if value is None else {name: getattr(value, name) for name in names}
 
 
-def _count(sorting: Sorting | None) -> dict[str, int] | None:
-    return None if sorting is None else {"n": len(sorting), **sorting.counts()}
+def _count(sorting: Sorting) -> dict[str, int]:
+    return {"n": len(sorting), **sorting.counts()}
 
 
-def _matches(explanation: FrameExplanation) -> dict[str, Any] | None:
-    matches, begin = explanation.matches, explanation.attempt.find("attempt")
-    if matches is None:
+def _matches(registration: Registration | None) -> dict[str, Any] | None:
+    if registration is None:
         return None
-    flow = np.linalg.norm(matches.partners - matches.pixels, axis=1)[matches.are_kept]
     return {
-        **{name: begin[name] for name in ("method", "is_wide", "radius_px")},
-        "has_prior": has_prior(explanation.attempt),
-        "median_flow_px": float(np.median(flow)) if len(flow) else None,
-        "n": len(matches),
-        **matches.counts(),
+        "radius_px": registration.radius_px,
+        "is_predicted": registration.is_predicted,
+        "row_motion_px": registration.row_motion_px,
+        "n_consensus": registration.consensus,
+        "is_known": registration.is_known,
+        "n_inliers": int(np.count_nonzero(registration.inliers)),
+        **_count(registration.matches),
     }
+
+
+def _residuals(registration: Registration | None) -> dict[str, Any] | None:
+    """Return the medians of the absolute residuals, before and after the refinement."""
+    if registration is None or registration.residuals_px is None:
+        return None
+    medians = np.nanmedian(np.abs(registration.residuals_px), axis=1)
+    return {
+        when: dict(zip(("u_px", "v_px", "disparity_px"), row, strict=True))
+        for when, row in zip(("before", "after"), medians.tolist(), strict=True)
+    }
+
+
+def _link(link: Link) -> dict[str, Any]:
+    found = link.registration
+    names = "frame", "stamp_ns", "kind", "overlap", "chi2", "is_accepted", "reason"
+    counts = {
+        name: 0 if found is None else getattr(found, name) for name in ("n_matches", "n_inliers")
+    }
+    return {name: getattr(link, name) for name in names} | counts

@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
+from gvo.viz.figures import HALF, HOLLOW, Plot, broken, evenly, legend_above, new_figure, plain
 from gvo.viz.palette import LOOP_STYLES, REFERENCE_STYLE, Style, styles_of
-from gvo.viz.plots import HOLLOW, ground_plane, plain
-from gvo.viz.report.sheets import HALF, Plot, arrange, display_path, fit_left
+from gvo.viz.plots import ground_plane
 
 _HEIGHT = 4.8
+# More would not be seen in a picture, and burden the page.
+_MAX_PATH_POINTS = 5000
 _MIN_EXTENT_M = 1e-3
 _MAX_SHOWN_M = 1e4
 _SPACE_LABEL_PAD = 9.0  # points; leaves room for numbers of four characters
 _SPACE_ZOOM = 0.78  # a long box, seen from a corner, must stay within its axes
 _DASHES = {"-": [], "--": [7, 5], "-.": [7, 4, 2, 4], ":": [2, 4]}
+
+
+TITLES = {"above": "From above", "side": "From the side", "space": "In space"}
+"""Of the views of paths, by slug."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,10 +75,19 @@ def lines_of(reference: Trajectory | None, estimates: Mapping[str, Trajectory]) 
     """Return the paths of trajectories in one world, the reference first."""
     lines = []
     if reference is not None:
-        lines.append(Line(name="truth", points=display_path(reference), style=REFERENCE_STYLE))
+        lines.append(Line(name="truth", points=_points_of(reference), style=REFERENCE_STYLE))
     for (name, estimate), style in zip(estimates.items(), styles_of(estimates), strict=True):
-        lines.append(Line(name=name, points=display_path(estimate), style=style))
+        lines.append(Line(name=name, points=_points_of(estimate), style=style))
     return lines
+
+
+def _points_of(trajectory: Trajectory) -> FloatArray:
+    """Return a path for display, shape (m, 3), with rows of NaN where poses are missing."""
+    points = broken(trajectory.stamps_ns / 1e9, trajectory.positions)
+    kept = evenly(len(points), _MAX_PATH_POINTS)
+    # A gap between two points that stay must stay, too.
+    gaps = np.flatnonzero(np.isnan(points[:, 0]))
+    return points[np.union1d(kept, gaps)]
 
 
 def loop_lines(ends: Mapping[str, FloatArray]) -> list[Line]:
@@ -100,18 +113,21 @@ def path_plots(lines: Sequence[Line], world: World) -> list[Plot]:
     return [
         Plot(
             slug="above",
+            title=TITLES["above"],
             text=f"{world.words} {scale} {_good_words(lines)}",
             figure=_view(near, labels, world.ground, is_flipped=False),
             is_half=True,
         ),
         Plot(
             slug="side",
+            title=TITLES["side"],
             text=f"{scale} Odometry drifts in height first: look for a slow climb or descent.",
             figure=_view(near, labels, (along, world.up), is_flipped=world.is_up_negative),
             is_half=True,
         ),
         Plot(
             slug="space",
+            title=TITLES["space"],
             text="The same paths; all three axes have one scale.",
             figure=_space(near, labels, world),
         ),
@@ -144,15 +160,15 @@ def _label(axis: str, origin: float) -> str:
 def _view(
     lines: Sequence[Line], labels: Sequence[str], plane: tuple[int, int], *, is_flipped: bool
 ) -> Figure:
-    figure = Figure(figsize=(HALF, _HEIGHT))
+    figure = new_figure(_HEIGHT, HALF)
     axes = figure.subplots()
     _draw_lines(axes, lines, plane)
     axes.set(xlabel=labels[plane[0]], ylabel=labels[plane[1]])
-    arrange(figure, axes)
-    _set_equal(axes, figure.get_size_inches() * axes.get_position().size)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.04)
+    legend_above(figure, axes)
     if is_flipped:
         axes.invert_yaxis()
-    fit_left(figure)
     return figure
 
 
@@ -162,18 +178,8 @@ def _draw_lines(axes: Any, lines: Sequence[Line], order: tuple[int, ...]) -> Non
     axes.plot(*lines[0].points[:1, order].T, "o", label="start", **HOLLOW)
 
 
-def _set_equal(axes: Axes, size: FloatArray) -> None:
-    """Set limits of one scale that fill axes of a size in inches."""
-    low, high = np.array(axes.dataLim.min), np.array(axes.dataLim.max)
-    centre, extents = 0.5 * (low + high), np.maximum(high - low, _MIN_EXTENT_M)
-    half = 0.54 * size * float(np.max(extents / size))
-    axes.set_xlim(centre[0] - half[0], centre[0] + half[0])
-    axes.set_ylim(centre[1] - half[1], centre[1] + half[1])
-    axes.set_aspect("equal", adjustable="box")
-
-
 def _space(lines: Sequence[Line], labels: Sequence[str], world: World) -> Figure:
-    figure = Figure(figsize=(HALF * 1.2, HALF))
+    figure = new_figure(HALF, 1.2 * HALF)
     axes: Any = figure.add_subplot(projection="3d")
     order = (*world.ground, world.up)
     _draw_lines(axes, lines, order)
@@ -186,8 +192,7 @@ def _space(lines: Sequence[Line], labels: Sequence[str], world: World) -> Figure
     if world.is_up_negative:
         axes.invert_zaxis()
     axes.view_init(elev=28, azim=-62)
-    arrange(figure, axes)
-    figure.subplots_adjust(left=0.02, right=0.94, bottom=0.04)
+    legend_above(figure, axes)
     return figure
 
 
@@ -201,12 +206,12 @@ def _set_box(axes: Any, points: FloatArray) -> None:  # noqa: ANN401
     axes.set_box_aspect(half, zoom=_SPACE_ZOOM)
 
 
-def scene_json(lines: Sequence[Line], world: World) -> str:
-    """Return the lines of the rotatable view as JSON that is safe within a script element."""
+def turning_scene(lines: Sequence[Line], world: World) -> dict[str, Any]:
+    """Return the lines of the view that turns, as plain values."""
     points = np.concatenate([line.points for line in lines])
     extent = float(np.nanmax(np.ptp(points[np.isfinite(points[:, 0])], axis=0)))
     n_decimals = max(0, 4 - int(np.floor(np.log10(max(extent, _MIN_EXTENT_M)))))
-    scene = {
+    return {
         "right": world.ground[0],
         "ahead": world.ground[1],
         "up": world.up,
@@ -221,10 +226,15 @@ def scene_json(lines: Sequence[Line], world: World) -> str:
             for line in lines
         ],
     }
-    return json.dumps(scene, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 
 
 def _pieces(points: FloatArray, n_decimals: int) -> list[list[list[float]]]:
     pieces = np.split(points, np.flatnonzero(np.isnan(points[:, 0])))
     solid = [piece[np.isfinite(piece[:, 0])] for piece in pieces]
     return [np.round(piece, n_decimals).tolist() for piece in solid if len(piece) > 0]
+
+
+def legend_of(lines: Sequence[Line]) -> list[tuple[str, str, str]]:
+    """Return name, colour and dashes of each line, as the page's legend takes them."""
+    dashes = {"-": "", "--": "6 4", "-.": "6 3 1 3", ":": "2 3"}
+    return [(line.name, line.style.color, dashes[line.style.linestyle]) for line in lines]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import cycle
 from typing import Any
 
@@ -20,16 +20,22 @@ from gvo.trajectory.evaluation import (
     Consistency,
     chi2_bound,
 )
-from gvo.types import FloatArray
+from gvo.types import FloatArray, IntArray
 from gvo.viz import palette
+from gvo.viz.figures import (
+    MANY,
+    Plot,
+    draw_curve,
+    elapsed,
+    legend_above,
+    new_figure,
+    plain,
+    plain_decades,
+)
 from gvo.viz.measures import Comparison, Drift, chi2_density, drift, drift_lengths
 from gvo.viz.palette import Style, styles_of
-from gvo.viz.plots import elapsed, plain
-from gvo.viz.report import sheets
-from gvo.viz.report.sheets import WIDE, Plot, arrange
 
 _ROW_HEIGHT = 2.1
-_N_COLUMNS = 350
 _SIGMAS = 3.0
 _RAW = Style(color=palette.ESTIMATES["raw"], linewidth=1.1, zorder=3.0)
 _ALIGNED = {
@@ -46,11 +52,33 @@ _PANELS = (
 _N_RIBBON = 400  # columns of the ribbon: a single frame must be visible
 _UNKNOWN = "#999999"
 _FLOOR = 1e-3  # of the logarithmic axis
-_N_DOT_COLUMNS, _N_DOT_ROWS = 300, 60  # cells for dots
 _MARKERS = {"step": "o", "keyframe": "s", "depth": "^"}
 _HATCHES = {"step": "", "keyframe": "////", "depth": "\\\\\\\\"}
 _DECADES = (-3.0, 3.0)  # of the histogram: powers of ten
 _N_BINS = 60
+
+
+TITLES = {
+    "errors_over_time": "Errors over time",
+    "errors_over_distance": "Errors over distance travelled",
+    "drift": "Drift by length of segment",
+    "covariance": "Errors within their covariances",
+    "status": "Status",
+    "counts": "Features, matches and inliers",
+    "timings": "Milliseconds per frame",
+    "chi2": "Chi-square of the edges",
+    "chi2_histogram": "Distribution of chi-square",
+}
+"""Of the plots of a run, by slug, in their order."""
+
+
+def not_drawn(slugs: Iterable[str], reason: str) -> list[Plot]:
+    """Return plots that say why they are not drawn."""
+    return [_plot(slug, text=f"Not drawn: {reason}.") for slug in slugs]
+
+
+def _plot(slug: str, *, text: str, figure: Figure | None = None) -> Plot:
+    return Plot(slug=slug, title=TITLES[slug], text=text, figure=figure)
 
 
 def error_plots(comparisons: Sequence[Comparison], align: AlignMode) -> list[Plot]:
@@ -61,14 +89,14 @@ def error_plots(comparisons: Sequence[Comparison], align: AlignMode) -> list[Plo
         else "The ground truth holds no rotations: there are no rotation errors."
     )
     return [
-        Plot(
-            slug="errors_over_time",
+        _plot(
+            "errors_over_time",
             text=f"Position errors {_ALIGNED[align]}. {rotations} "
             "Good curves are low and smooth; a step is a single bad frame.",
             figure=_curves_over_time(comparisons),
         ),
-        Plot(
-            slug="errors_over_distance",
+        _plot(
+            "errors_over_distance",
             text="The same errors over the distance along the true path: a steady slope is drift "
             "in metres per metre; while the camera stands still, so must the curve.",
             figure=_curves(
@@ -90,14 +118,14 @@ def _curves(
 ) -> Figure:
     has_rotations = any(c.errors_rad is not None for c in comparisons)
     n_rows = 2 if has_rotations else 1
-    figure = Figure(figsize=(WIDE, 0.9 + n_rows * _ROW_HEIGHT))
+    figure = new_figure(0.9 + n_rows * _ROW_HEIGHT)
     rows = figure.subplots(n_rows, 1, sharex=True, squeeze=False)[:, 0]
     for c, style in zip(comparisons, styles_of(c.name for c in comparisons), strict=True):
         x, seconds = abscissa(c), c.reference.stamps_ns / 1e9
         text = f"{c.name} (RMSE {c.ate_m:.3g} m)"
-        sheets.draw_curve(rows[0], x, c.errors_m, style, seconds=seconds, label=text)
+        draw_curve(rows[0], x, c.errors_m, style, seconds=seconds, label=text)
         if c.errors_rad is not None:
-            sheets.draw_curve(rows[1], x, np.rad2deg(c.errors_rad), style, seconds=seconds)
+            draw_curve(rows[1], x, np.rad2deg(c.errors_rad), style, seconds=seconds)
     rows[0].set_ylabel("position error [m]")
     if has_rotations:
         rows[1].set_ylabel("rotation error [deg]")
@@ -105,7 +133,7 @@ def _curves(
         axes.set_ylim(bottom=0.0)
         axes.margins(x=0.01)
     rows[-1].set_xlabel(label)
-    arrange(figure, rows[0])
+    legend_above(figure, rows[0])
     figure.align_ylabels(list(rows))
     return figure
 
@@ -132,12 +160,12 @@ def drift_plot(
             if any(c.errors_rad is None for c in comparisons)
             else f"the path of {path_m:.2g} m is too short for segments"
         )
-        return Plot(slug="drift", text=f"Not drawn: {reason}.")
+        return _plot("drift", text=f"Not drawn: {reason}.")
     origin = "the lengths asked for" if is_asked else f"round lengths for a path of {path_m:.3g} m"
     if lengths == KITTI_SEGMENTS_M:
         origin = "the standard lengths of the KITTI benchmark"
-    return Plot(
-        slug="drift",
+    return _plot(
+        "drift",
         text=f"Mean error over all segments of a length, as in KITTI's devkit; {origin}. "
         "Translation drift falls with the length where errors are random, and stays level where "
         "scale or heading is biased; rotation drift should fall as well. The longest length is "
@@ -147,7 +175,7 @@ def drift_plot(
 
 
 def _drift_figure(found: Sequence[tuple[str, Drift | None]]) -> Figure:
-    figure = Figure(figsize=(WIDE, 3.5))
+    figure = new_figure(3.5)
     panels: Any = figure.subplots(1, 2)
     styles = styles_of(name for name, _ in found)
     for (name, item), style, marker in zip(found, styles, cycle("osD^vP*X"), strict=False):
@@ -159,8 +187,7 @@ def _drift_figure(found: Sequence[tuple[str, Drift | None]]) -> Figure:
     panels[1].set(xlabel="length of segment [m]", ylabel="rotation error [deg/m]")
     for axes in panels:
         axes.set(xlim=(0.0, None), ylim=(0.0, 1.1 * axes.dataLim.y1 or 1.0))
-    arrange(figure, panels[0])
-    figure.subplots_adjust(wspace=0.2)
+    legend_above(figure, panels[0])
     return figure
 
 
@@ -175,8 +202,8 @@ def covariance_plot(item: Consistency, first_ns: int) -> Plot:
         Stamp of elapsed time zero.
     """
     inside = 100.0 * np.mean(np.abs(item.errors) <= _SIGMAS * item.sigmas, axis=0)
-    return Plot(
-        slug="covariance",
+    return _plot(
+        "covariance",
         text=f"Errors of the motion, {item.name}, along the axes of its last pose, with the "
         f"stated 3-sigma bands; nothing is aligned. Inside are {inside[3:].mean():.1f} % of the "
         f"position and {inside[:3].mean():.1f} % of the rotation errors; 99.7 % where the "
@@ -186,41 +213,39 @@ def covariance_plot(item: Consistency, first_ns: int) -> Plot:
 
 
 def _bands(item: Consistency, first_ns: int) -> Figure:
-    figure = Figure(figsize=(WIDE, 5.2))
+    figure = new_figure(5.2)
     panels: Any = figure.subplots(2, 3, sharex=True)
     x = elapsed(item.end_ns, first_ns)
     for panel, (index, letter, unit) in zip(panels.flat, _PANELS, strict=True):
         factor = 1.0 if unit == "m" else float(np.rad2deg(1.0))
         _draw_band(panel, x, _SIGMAS * factor * item.sigmas[:, index])
         y = factor * item.errors[:, index]
-        sheets.draw_curve(panel, x, y, _RAW, label=item.name, n_columns=_N_COLUMNS)
+        draw_curve(panel, x, y, _RAW, label=item.name)
         kind = "position" if unit == "m" else "rotation"
         panel.set_ylabel(f"{kind} {letter} [{unit}]")
     for panel in panels[-1]:
         panel.set_xlabel("elapsed [s]")
-    arrange(figure, panels[0, 0])
-    figure.subplots_adjust(wspace=0.4, hspace=0.1)
-    sheets.fit_left(figure)
+    legend_above(figure, panels[0, 0])
     figure.align_ylabels()
     return figure
 
 
 def _draw_band(axes: Any, x: FloatArray, reach: FloatArray) -> None:  # noqa: ANN401
-    kept = sheets.kept_of_curve(x, reach, n_columns=_N_COLUMNS)
-    x, reach = x[kept], reach[kept]
     label = "\u00b13 sigma"
     if len(x) == 1:  # a band of one pose has no area
         axes.plot([x[0], x[0]], [-reach[0], reach[0]], color=_RAW.color, marker="_", label=label)
     else:
-        axes.fill_between(x, -reach, reach, color=_RAW.color, alpha=0.2, lw=0, label=label)
+        is_many = len(x) > MANY
+        looks: dict[str, Any] = {"alpha": 0.2, "lw": 0, "label": label, "rasterized": is_many}
+        axes.fill_between(x, -reach, reach, color=_RAW.color, **looks)
 
 
 def status_plot(frames: FrameTable) -> Plot:
     """Return the ribbon of statuses, a row for each that occurs."""
     if len(frames.stamps_ns) == 0:
-        return Plot(slug="status", text="Not drawn: the run has no frame.")
-    return Plot(
-        slug="status",
+        return _plot("status", text="Not drawn: the run has no frame.")
+    return _plot(
+        "status",
         text="The status of each frame, with a row and the number of frames for each status that "
         "occurs; single frames are widened to be seen. A good run has one row: ok.",
         figure=_ribbon(frames),
@@ -230,7 +255,7 @@ def status_plot(frames: FrameTable) -> Plot:
 def _ribbon(frames: FrameTable) -> Figure:
     counts = Counter(frames.statuses)
     names = [name for name in dict.fromkeys([*palette.STATUSES, *counts]) if counts[name]]
-    figure = Figure(figsize=(WIDE, 0.85 + 0.32 * len(names)))
+    figure = new_figure(0.85 + 0.32 * len(names))
     axes = figure.subplots()
     x = elapsed(frames.stamps_ns, int(frames.stamps_ns[0]))
     statuses = np.array(frames.statuses)
@@ -248,7 +273,6 @@ def _ribbon(frames: FrameTable) -> Figure:
     axes.grid(axis="y", visible=False)
     axes.margins(x=0.005)
     axes.set_xlabel("elapsed [s]")
-    arrange(figure, left=1.15)
     return figure
 
 
@@ -258,11 +282,28 @@ def _spans(x: FloatArray, is_there: Any) -> list[tuple[float, float]]:  # noqa: 
     step = float(np.median(np.diff(np.unique(x)))) if x[-1] > x[0] else extent
     n_columns = max(1, min(_N_RIBBON, round(extent / step) + 1))
     marks = np.zeros(n_columns + 2, dtype=np.int64)
-    marks[1 + sheets.columns_of(x, n_columns)[is_there]] = 1
+    marks[1 + _columns_of(x, n_columns)[is_there]] = 1
     edges = np.flatnonzero(np.diff(marks)).reshape(-1, 2)
     width = (extent + step) / n_columns if len(x) > 1 else 1.0
     starts, widths = x[0] + edges[:, 0] * width, (edges[:, 1] - edges[:, 0]) * width
     return [(float(a), float(b)) for a, b in zip(starts, widths, strict=True)]
+
+
+def _columns_of(x: FloatArray, n_columns: int) -> IntArray:
+    """Return the column of each increasing x, from 0 to n_columns - 1."""
+    extent = float(x[-1] - x[0])
+    if extent <= 0.0:
+        return np.zeros(len(x), dtype=np.int64)
+    columns = np.minimum((x - x[0]) / extent * n_columns, n_columns - 1)
+    return np.asarray(columns, dtype=np.int64)
+
+
+def _time_axes(height: float, label: str) -> tuple[Figure, Axes]:
+    figure = new_figure(height)
+    axes = figure.subplots()
+    axes.margins(x=0.01)
+    axes.set(xlabel="elapsed [s]", ylabel=label)
+    return figure, axes
 
 
 def count_plot(frames: FrameTable) -> Plot:
@@ -270,22 +311,22 @@ def count_plot(frames: FrameTable) -> Plot:
     present = {n: frames.counts[n] for n in palette.COUNTS if n in frames.counts}
     has_pose = np.array([status != "skipped" for status in frames.statuses], dtype=np.bool_)
     if not present or not np.any(has_pose):
-        return Plot(slug="counts", text="Not drawn: the run has no counts; its edges were given.")
-    figure, axes = sheets.time_axes(3.0, "number per frame [-]")
+        return _plot("counts", text="Not drawn: the run has no counts; its edges were given.")
+    figure, axes = _time_axes(3.0, "number per frame [-]")
     x = elapsed(frames.stamps_ns, int(frames.stamps_ns[0]))
     for name, counts in present.items():
         y = np.where(has_pose, counts, np.nan).astype(np.float64)
         if name in ("matches", "inliers"):
             y[np.argmax(has_pose)] = np.nan  # nothing precedes the first frame
-        sheets.draw_curve(axes, x, y, Style(color=palette.COUNTS[name]), label=name)
+        draw_curve(axes, x, y, Style(color=palette.COUNTS[name]), label=name)
     axes.set_ylim(bottom=0.0)
-    arrange(figure, axes)
+    legend_above(figure, axes)
     text = (
         "Keypoints, points with depth, matches with the previous frame, and inliers of the motion. "
         "Good curves lie near each other and far above ransac.min_inliers; "
         f"{_inlier_words(frames)}"
     )
-    return Plot(slug="counts", text=text, figure=figure)
+    return _plot("counts", text=text, figure=figure)
 
 
 def _inlier_words(frames: FrameTable) -> str:
@@ -304,18 +345,18 @@ def _inlier_words(frames: FrameTable) -> str:
 def timing_plot(timings: TimingTable | None) -> Plot:
     """Return the milliseconds per frame, stacked by stage."""
     if timings is None or len(timings.stamps_ns) == 0 or not timings.stages_ms:
-        return Plot(slug="timings", text="Not drawn: the run has no times of its stages.")
+        return _plot("timings", text="Not drawn: the run has no times of its stages.")
     table = np.nan_to_num(np.stack(list(timings.stages_ms.values())))
     total = table.sum(axis=0)
     median, slow = np.quantile(total, [0.5, 0.95])
-    figure, axes = sheets.time_axes(3.2, "milliseconds per frame [ms]")
+    figure, axes = _time_axes(3.2, "milliseconds per frame [ms]")
     _stack(axes, timings, table)
     axes.axhline(median, color="black", lw=1.0, label=f"median {median:.1f}")
     axes.axhline(slow, color="black", lw=1.0, ls=":", label=f"95 %: {slow:.1f}")
     axes.set_ylim(0.0, 1.05 * float(total.max()) or 1.0)
-    arrange(figure, axes)
-    return Plot(
-        slug="timings",
+    legend_above(figure, axes)
+    return _plot(
+        "timings",
         text="Wall time of each frame, stacked by stage, with the medians in brackets. The median "
         f"frame took {median:.1f} ms, 95 % took less than {slow:.1f} ms, the slowest "
         f"{total.max():.1f} ms. {_rate_words(timings, total)}",
@@ -325,14 +366,13 @@ def timing_plot(timings: TimingTable | None) -> Plot:
 
 def _stack(axes: Axes, timings: TimingTable, table: FloatArray) -> None:
     x = elapsed(timings.stamps_ns, int(timings.stamps_ns[0]))
-    kept = sheets.kept_of_curve(x, table.sum(axis=0), n_columns=sheets.N_COLUMNS // 2)
-    at, drawn = x[kept], table[:, kept]
     if len(x) == 1:  # a stack of one frame has no width
-        at, drawn = np.array([-0.5, 0.5]), np.repeat(table, 2, axis=1)
+        x, table = np.array([-0.5, 0.5]), np.repeat(table, 2, axis=1)
     stages = timings.stages_ms
     labels = [f"{name} ({np.median(row):.1f})" for name, row in zip(stages, table, strict=True)]
     colours = [palette.STAGES.get(name, _UNKNOWN) for name in stages]
-    axes.stackplot(at, drawn, labels=labels, colors=colours, step="mid", lw=0)
+    looks: dict[str, Any] = {"step": "mid", "lw": 0, "rasterized": len(x) > MANY}
+    axes.stackplot(x, table, labels=labels, colors=colours, **looks)
 
 
 def _rate_words(timings: TimingTable, total: FloatArray) -> str:
@@ -357,12 +397,12 @@ def edge_plots(edges: EdgeTable | None, first_ns: int) -> list[Plot]:
     """
     if edges is None or not np.any(np.isfinite(edges.chi2)):
         reason = "Not drawn: the run has no edges with residuals."
-        return [Plot(slug=slug, text=reason) for slug in ("chi2", "chi2_histogram")]
+        return [_plot(slug, text=reason) for slug in ("chi2", "chi2_histogram")]
     bound = chi2_bound(0.95)
     n_refused = int(np.count_nonzero(~edges.is_accepted))
     return [
-        Plot(
-            slug="chi2",
+        _plot(
+            "chi2",
             text="Squared residual of each edge over its stated covariance, after the window was "
             f"optimized with its frame; values under {_FLOOR:g} are drawn there. A residual with "
             f"six degrees of freedom has mean {N_DOF}, and 95 % are under {bound:.1f}. "
@@ -370,8 +410,8 @@ def edge_plots(edges: EdgeTable | None, first_ns: int) -> list[Plot]:
             f"bound and for refused edges: {n_refused} of {len(edges.chi2)} here.",
             figure=_dots(edges, first_ns, bound),
         ),
-        Plot(
-            slug="chi2_histogram",
+        _plot(
+            "chi2_histogram",
             text="The same of the accepted edges, with the density for six degrees of freedom; "
             f"the outermost bins include everything beyond. {_mean_words(edges, bound)} Bars left "
             "of the curve mean conservative covariances, bars right of it too small ones. Frames "
@@ -399,7 +439,7 @@ def _mean_words(edges: EdgeTable, bound: float) -> str:
 
 
 def _dots(edges: EdgeTable, first_ns: int, bound: float) -> Figure:
-    figure, axes = sheets.time_axes(3.2, "chi-square [-]")
+    figure, axes = _time_axes(3.2, "chi-square [-]")
     is_known = np.isfinite(edges.chi2)
     x = elapsed(edges.stamps_ns, first_ns)
     y = np.maximum(np.where(is_known, edges.chi2, 1.0), _FLOOR)
@@ -412,20 +452,20 @@ def _dots(edges: EdgeTable, first_ns: int, bound: float) -> Figure:
     axes.axhline(N_DOF, color="black", lw=1.0, ls=":", label="6: mean of 6 dof")
     axes.axhline(bound, color="black", lw=1.0, ls="--", label=f"{bound:.1f}: 95 % bound of 6 dof")
     axes.set_yscale("log")
-    sheets.plain_decades(axes.yaxis)
+    plain_decades(axes.yaxis)
     axes.set_ylim(0.7 * _FLOOR, max(40.0, 2.0 * float(y.max())))
-    arrange(figure, axes)
+    legend_above(figure, axes)
     return figure
 
 
 def _scatter(axes: Any, x: FloatArray, y: FloatArray, label: str, **looks: Any) -> None:  # noqa: ANN401
     if len(x) > 0:
-        kept = sheets.kept_of_dots(x, np.log10(y), n_columns=_N_DOT_COLUMNS, n_rows=_N_DOT_ROWS)
-        axes.plot(x[kept], y[kept], linestyle="", markeredgewidth=0.8, label=label, **looks)
+        looks |= {"markeredgewidth": 0.8, "rasterized": len(x) > MANY}
+        axes.plot(x, y, linestyle="", label=label, **looks)
 
 
 def _histogram(edges: EdgeTable, bound: float) -> Figure:
-    figure = Figure(figsize=(WIDE, 3.0))
+    figure = new_figure(3.0)
     axes: Any = figure.subplots()
     is_free = _is_free(edges)
     for kind in palette.LINKS:
@@ -439,7 +479,7 @@ def _histogram(edges: EdgeTable, bound: float) -> Figure:
     axes.set_xticks(list(decades), [f"{10.0**decade:g}" for decade in decades])
     axes.set(xlabel="chi-square [-]", ylabel="density per decade [-]")
     axes.set(xlim=_DECADES, ylim=(0.0, None))
-    arrange(figure, axes)
+    legend_above(figure, axes)
     return figure
 
 

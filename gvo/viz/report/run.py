@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gvo._text import html_text, number_text
+from gvo._text import number_text
 from gvo.config import Config
 from gvo.errors import TrajectoryError
 from gvo.frontend.calibration import describe_offsets
@@ -16,20 +16,29 @@ from gvo.io.run_folder.reader import LoopTable, RunRecord, loop_words, verdict
 from gvo.trajectory.alignment import AlignMode
 from gvo.trajectory.evaluation import Evaluation, consistency, evaluation_table, motions_of_chain
 from gvo.trajectory.trajectory import Trajectory
+from gvo.viz.figures import Plot, elapsed, evenly, style, write_plots
 from gvo.viz.measures import Comparison, compare
-from gvo.viz.plots import elapsed, evenly
-from gvo.viz.report import page
-from gvo.viz.report.paths import Line, World, lines_of, loop_lines, path_plots
+from gvo.viz.pages import changes, write_page
+from gvo.viz.report.paths import (
+    TITLES,
+    Line,
+    World,
+    legend_of,
+    lines_of,
+    loop_lines,
+    path_plots,
+    turning_scene,
+)
 from gvo.viz.report.plots import (
     count_plot,
     covariance_plot,
     drift_plot,
     edge_plots,
     error_plots,
+    not_drawn,
     status_plot,
     timing_plot,
 )
-from gvo.viz.report.sheets import Plot, settings, write_plots
 
 _TRUTH_PLOTS = ("errors_over_time", "errors_over_distance", "drift", "covariance")
 _LOOP_COLUMNS = ("at [s]", "place of [s]", "inliers", "residual", "why refused")
@@ -51,12 +60,6 @@ _NEES_COLUMNS = {
     "nees": "both",
     "chance": "by chance",
 }
-_NEES_NOTE = (
-    "Errors of relative motions (RMSE), and their squares over the stated covariances per degree "
-    "of freedom (NEES): one where the covariances fit, four where the sigmas should be twice as "
-    "large. In the last column, 95 % of what chance makes of one. Noise of the true poses counts "
-    "as error."
-)
 
 
 def write_comparison_report(
@@ -102,17 +105,28 @@ def write_comparison_report(
     shown = truth_around(truth, [c.reference for c in compared])
     names = ", ".join(trajectories)
     facts = {"Estimates": names, "Poses of the reference": str(len(truth)), "Alignment": align}
-    with settings():
+    with style():
         lines = lines_of(shown, {c.name: c.trajectory for c in compared})
-        sheets = path_plots(lines, world) + error_plots(compared, align)
-        sheets.append(drift_plot(compared, asked_m=asked_m))
+        drawn = path_plots(lines, world) + error_plots(compared, align)
+        drawn.append(drift_plot(compared, asked_m=asked_m))
         if path is not None:
-            table = page.table_html(*evaluation_table(evaluations))
-            head = ["<h1>Comparison of trajectories</h1>", page.facts_html(facts), table]
-            body = [*head, *page.plots_html(sheets, lines, world)]
-            page.write_page(Path(path), f"Comparison: {names}", body)
+            header, rows = evaluation_table(evaluations)
+            write_page(
+                Path(path),
+                "comparison.html",
+                title=f"Comparison: {names}",
+                facts=facts,
+                table={"header": header, "rows": rows},
+                **_pictures(drawn, lines, world),
+            )
         if plots is not None:
-            write_plots(sheets, Path(plots))
+            write_plots(drawn, Path(plots))
+
+
+def _pictures(plots: Sequence[Plot], lines: Sequence[Line], world: World | None) -> dict[str, Any]:
+    """Return what a page needs of its plots, the turning one included."""
+    scene = None if world is None else turning_scene(lines, world)
+    return {"plots": plots, "scene": scene, "legend": legend_of(lines)}
 
 
 def truth_around(truth: Trajectory, parts: Sequence[Trajectory]) -> Trajectory:
@@ -145,12 +159,12 @@ def write_run_report(
     """
     estimates = record.comparable()
     compared, reason = _compare(record, estimates)
-    with settings():
+    with style():
         lines, world = _lines(record, estimates, compared)
         if record.loops is not None and "global" in estimates:
             shown = {"global": estimates["global"]} | {c.name: c.trajectory for c in compared}
             lines += loop_lines(record.loops.lines_on(shown["global"]))
-        sheets = [
+        drawn = [
             *_path_plots(lines, world),
             *_truth_plots(record, compared, reason),
             status_plot(record.frames),
@@ -159,10 +173,9 @@ def write_run_report(
             *edge_plots(record.edges, _first_ns(record)),
         ]
         # The page first: it must exist even if the folder cannot be written.
-        body = [*_head(record), *page.plots_html(sheets, lines, world), *_tail(record)]
-        page.write_page(Path(path), f"gvo: {record.name}", body)
+        write_page(Path(path), "report.html", **_words(record), **_pictures(drawn, lines, world))
         if plots is not None:
-            write_plots(sheets, Path(plots))
+            write_plots(drawn, Path(plots))
 
 
 def _compare(
@@ -196,13 +209,12 @@ def _path_plots(lines: list[Line], world: World | None) -> list[Plot]:
     if world is not None:
         return path_plots(lines, world)
     text = "Not drawn: the run has no poses."
-    return [Plot(slug=slug, text=text) for slug in ("above", "side", "space")]
+    return [Plot(slug=slug, title=title, text=text) for slug, title in TITLES.items()]
 
 
 def _truth_plots(record: RunRecord, compared: list[Comparison], reason: str) -> list[Plot]:
     if not compared or record.truth is None:
-        text = f"Not drawn: errors need ground truth, and {reason.removesuffix('.')}."
-        return [Plot(slug=slug, text=text) for slug in _TRUTH_PLOTS]
+        return not_drawn(_TRUTH_PLOTS, f"errors need ground truth, and {reason.removesuffix('.')}")
     return [
         *error_plots(compared, "se3"),
         drift_plot(compared),
@@ -220,7 +232,7 @@ def _covariance_plot(record: RunRecord, truth: Trajectory) -> Plot:
         if not truth.has_rotations
         else "no motion over a second has true poses and a covariance"
     )
-    return Plot(slug="covariance", text=f"Not drawn: {reason}.")
+    return not_drawn(["covariance"], reason)[0]
 
 
 def _first_ns(record: RunRecord) -> int:
@@ -228,44 +240,35 @@ def _first_ns(record: RunRecord) -> int:
     return int(stamps_ns[0]) if len(stamps_ns) > 0 else 0
 
 
-def _head(record: RunRecord) -> list[str]:
+def _words(record: RunRecord) -> dict[str, Any]:
+    """Return what the page of a run says beside its plots."""
     summary = record.summary
-    parts = [f"<h1>{html_text(record.name)}</h1>"]
-    if "frames" in summary:
-        parts.append(f'<p class="verdict">{html_text(verdict(summary))}</p>')
-    if loop_words(summary):
-        parts.append(f"<p>{html_text(loop_words(summary))}.</p>")
-    if not record.is_finished:
-        parts.append(
-            '<p class="absent">This run has not ended: it is running or was interrupted. '
-            "The report shows what was written so far.</p>"
-        )
-    parts.append(page.list_html("Warnings", map(str, summary.get("warnings", ())), kind="warnings"))
-    parts.append(page.facts_html(_facts(record)))
-    if summary.get("errors"):
-        header = ("estimate", "poses", *_ERROR_COLUMNS.values())
-        parts.append(page.table_html(header, map(_error_row, summary["errors"])))
-    if summary.get("covariances"):
-        parts.append(
-            page.table_html([*_NEES_COLUMNS.values()], map(_nees_row, summary["covariances"]))
-        )
-        parts.append(f'<p class="note">{_NEES_NOTE}</p>')
-    return [part for part in parts if part]
+    covariances = [_nees_row(row) for row in summary.get("covariances", ())]
+    errors = [_error_row(row) for row in summary.get("errors", ())]
+    return {
+        "title": f"gvo: {record.name}",
+        "name": record.name,
+        "verdict": verdict(summary) if "frames" in summary else "",
+        "loop_words": loop_words(summary),
+        "is_finished": record.is_finished,
+        "warnings": [str(each) for each in summary.get("warnings", ())],
+        "facts": _facts(record),
+        "errors": _table(("estimate", "poses", *_ERROR_COLUMNS.values()), errors),
+        "covariances": _table([*_NEES_COLUMNS.values()], covariances),
+        "loops": _loops(record.loops, _first_ns(record)),
+        "decisions": [str(each) for each in summary.get("decisions", ())],
+        "configuration": changes(summary.get("configuration", {}), Config().model_dump()),
+    }
 
 
-def _tail(record: RunRecord) -> list[str]:
-    summary = record.summary
-    return [
-        *_loops(record.loops, _first_ns(record)),
-        page.list_html("Decisions", map(str, summary.get("decisions", ()))),
-        page.configuration_html(summary.get("configuration", {}), Config().model_dump()),
-    ]
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> dict[str, Any] | None:
+    return {"header": header, "rows": rows} if rows else None
 
 
-def _loops(loops: LoopTable | None, first_ns: int) -> list[str]:
+def _loops(loops: LoopTable | None, first_ns: int) -> dict[str, Any] | None:
     """Return the table of loops; of many, some all over the run."""
     if loops is None or not loops.reasons:
-        return []
+        return None
     n = len(loops.reasons)
     chosen = evenly(n, _MAX_LOOPS)
     ends = (elapsed(stamps_ns, first_ns) for stamps_ns in (loops.stamps_ns, loops.reference_ns))
@@ -277,14 +280,7 @@ def _loops(loops: LoopTable | None, first_ns: int) -> list[str]:
     )
     rows = [[column[index] for column in columns] for index in chosen]
     rest = f"; {n - len(chosen)} more are in loops.csv" if n > len(chosen) else ""
-    note = (
-        "Frames that were registered against a place of long before. The residual is the norm of "
-        f"the whitened one, about 2.4 where the covariances fit{rest}."
-    )
-    return [
-        f'<section id="loops">\n<h2>Loops</h2>\n<p class="note">{note}</p>\n'
-        f"{page.table_html(_LOOP_COLUMNS, rows)}</section>"
-    ]
+    return {"header": _LOOP_COLUMNS, "rows": rows, "rest": rest}
 
 
 def _error_row(row: Mapping[str, Any]) -> list[str]:

@@ -1,0 +1,214 @@
+"""What was found in the frame itself: keypoints with disparity or depth, and one corner."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+
+from gvo.config import Config, DepthConfig
+from gvo.diagnostics.explain.values import Corner, Sorting
+from gvo.frontend.calibration import RigOffsets
+from gvo.frontend.features import FeatureExtractor
+from gvo.frontend.klt import image_of
+from gvo.frontend.matching import best_ratios
+from gvo.frontend.rgbd import sample_depth
+from gvo.frontend.stereo.corners import measure_corners
+from gvo.frontend.stereo.matching import (
+    candidate_pairs,
+    compare_rows,
+    is_in_depth_range,
+    match_stereo,
+    refine_disparities,
+)
+from gvo.frontend.stereo.patches import PATCH_RADIUS_PX
+from gvo.frontend.tracking import WINDOW_RADIUS_PX, detect_corners, halve
+from gvo.geometry.camera import StereoCamera
+from gvo.types import (
+    BoolArray,
+    FloatArray,
+    Frame,
+    ImageArray,
+    IntArray,
+    RgbdFrame,
+    StereoFrame,
+)
+
+# Columns of the correlation on either side of the partner, for RGB-D.
+_REACH_PX = 20
+
+
+def explain_measured(
+    frame: Frame, camera: StereoCamera, config: Config, offsets: RigOffsets
+) -> Sorting:
+    """Sort the keypoints by the tests of their matches in the right image, or of their depth."""
+    is_klt = config.frontend.kind == "klt"
+    if isinstance(frame, RgbdFrame):
+        return _sort_depths(frame, config, is_klt=is_klt)
+    sort = _sort_corners if is_klt else _sort_matches
+    return sort(frame, camera, config, offsets)
+
+
+def _sort_depths(frame: RgbdFrame, config: Config, *, is_klt: bool) -> Sorting:
+    if is_klt:
+        pixels = detect_corners(frame.image, config.klt.n_corners)
+    else:
+        pixels = FeatureExtractor(config.features).extract(frame.image).keypoints
+    depths, is_valid = sample_depth(frame.depth, pixels, config.depth)
+    tests = _depth_tests(depths, is_valid, config.depth)
+    return Sorting(tests=tests, pixels=pixels, values=depths)
+
+
+def _depth_tests(
+    depths: FloatArray, is_valid: BoolArray, config: DepthConfig
+) -> dict[str, BoolArray]:
+    with np.errstate(invalid="ignore"):
+        is_in_range = (depths >= config.min_depth_m) & (depths <= config.max_depth_m)
+    return {
+        "depth unknown": np.isfinite(depths),
+        "depth out of range": is_in_range,
+        "depth edge": is_valid,
+    }
+
+
+def _sort_corners(
+    frame: StereoFrame, camera: StereoCamera, config: Config, offsets: RigOffsets
+) -> Sorting:
+    halves = halve(frame.left), halve(frame.right)
+    pixels = detect_corners(frame.left, config.klt.n_corners, half=halves[0])
+    row_px = offsets.row.value
+    found = measure_corners(
+        (frame.left, frame.right),
+        halves,
+        pixels,
+        config.stereo,
+        max_disparity=float(camera.depth_to_disparity(config.stereo.min_depth_m)),
+        row_offset_px=row_px,
+    )
+    disparities = found.disparities
+    corrected = disparities - offsets.disparity_px
+    tests = {
+        "not found along the row": np.isfinite(disparities),
+        "left and right unlike": found.are_reliable,
+        "depth out of range": is_in_depth_range(corrected, camera, config.stereo),
+    }
+    partners = np.column_stack([pixels[:, 0] - disparities, pixels[:, 1] + row_px])
+    return Sorting(tests=tests, pixels=pixels, partners=partners, values=disparities)
+
+
+def _sort_matches(
+    frame: StereoFrame, camera: StereoCamera, config: Config, offsets: RigOffsets
+) -> Sorting:
+    extractor, stereo = FeatureExtractor(config.features), config.stereo
+    left, right = extractor.extract(frame.left), extractor.extract(frame.right)
+    in_range = candidate_pairs(left, right, camera, stereo)
+    tried = compare_rows(left, right, in_range)
+    pairs, n = match_stereo(left, right, camera, stereo), len(left)
+    ends = left.keypoints[pairs[:, 0]], right.keypoints[pairs[:, 1]]
+    found, is_fitted = refine_disparities((frame.left, frame.right), *ends, stereo)
+    is_in_range = is_fitted & is_in_depth_range(found - offsets.disparity_px, camera, stereo)
+    tests = {
+        "no keypoint on its row in range": as_mask(in_range[:, 0], n),
+        "octave": as_mask(tried[0][:, 0], n),
+        **distance_tests(*tried, n, max_distance=stereo.max_distance, max_ratio=stereo.max_ratio),
+        "reciprocity": as_mask(pairs[:, 0], n),
+        "sub-pixel": as_mask(pairs[is_fitted, 0], n),
+        "depth out of range": as_mask(pairs[is_in_range, 0], n),
+    }
+    disparities, partners = np.full(n, np.nan), np.full((n, 2), np.nan)
+    disparities[pairs[:, 0]] = found
+    partners[pairs[:, 0]] = np.column_stack([ends[0][:, 0] - found, ends[1][:, 1]])
+    return Sorting(tests=tests, pixels=left.keypoints, partners=partners, values=disparities)
+
+
+def distance_tests(
+    pairs: IntArray, distances: FloatArray, n: int, *, max_distance: float, max_ratio: float
+) -> Mapping[str, BoolArray]:
+    """Tell which of n points have a candidate near enough, and one that stands out."""
+    tests = {"descriptor distance": as_mask(pairs[distances <= max_distance, 0], n)}
+    if max_ratio < 1.0:
+        tests["ratio"] = best_ratios(pairs[:, 0], distances, n) <= max_ratio
+    return tests
+
+
+def as_mask(indices: IntArray, n: int) -> BoolArray:
+    """Return n flags, True at some indices."""
+    mask = np.zeros(n, dtype=np.bool_)
+    mask[indices] = True
+    return mask
+
+
+def explain_disparity(
+    frame: StereoFrame, camera: StereoCamera, measured: Sorting, config: Config
+) -> Corner | None:
+    """Follow one corner of those kept along its row in the right image."""
+    kept = measured.are_kept
+    index = _typical(frame.left, measured.pixels[kept], PATCH_RADIUS_PX)
+    if index is None:
+        return None
+    pixel, partner = measured.pixels[kept][index], measured.partners[kept][index]
+    highest = min(camera.depth_to_disparity(config.stereo.min_depth_m), pixel[0])
+    disparities = np.arange(0.0, float(highest) + 1.0)
+    return _follow(
+        (frame.left, frame.right),
+        pixel,
+        partner,
+        # From left to right in the image: from the largest disparity to the smallest.
+        columns=(disparities[::-1], pixel[0] - disparities[::-1]),
+        radius=PATCH_RADIUS_PX,
+    )
+
+
+def explain_track(
+    frames: tuple[Frame, Frame], matches: Sorting, inliers: BoolArray, config: Config
+) -> Corner | None:
+    """Follow one point from the reference into the current image."""
+    images, radius = (image_of(frames[0]), image_of(frames[1])), WINDOW_RADIUS_PX
+    kept = np.flatnonzero(matches.are_kept)[inliers]
+    index = _typical(images[0], matches.pixels[kept], radius)
+    if index is None:
+        return None
+    pixel, partner = matches.pixels[kept][index], matches.partners[kept][index]
+    steps = np.arange(-_REACH_PX, _REACH_PX + 1.0)
+    return _follow(images, pixel, partner, columns=(steps, partner[0] + steps), radius=radius)
+
+
+def _typical(image: ImageArray, pixels: FloatArray, radius: int) -> int | None:
+    """Return the pixel whose patch determines its column better than half of the others."""
+    patches = [_patch(image, pixel, radius) for pixel in pixels]
+    gradients = [float(np.sum(np.diff(patch, axis=1) ** 2)) for patch in patches]
+    if not gradients:
+        return None
+    return int(np.argsort(gradients, kind="stable")[len(gradients) // 2])
+
+
+def _follow(
+    images: tuple[ImageArray, ImageArray],
+    pixel: FloatArray,
+    partner: FloatArray,
+    *,
+    columns: tuple[FloatArray, FloatArray],
+    radius: int,
+) -> Corner:
+    """Correlate a patch with the row of its partner, at columns named by the first of both."""
+    first = _patch(images[0], pixel, radius)
+    names, places = columns
+    middle = (0.5 * (places[0] + places[-1]), partner[1])
+    size = (len(places) + 2 * radius, 2 * radius + 1)
+    strip = cv2.getRectSubPix(images[1], size, middle, patchType=cv2.CV_32F)
+    found = cv2.matchTemplate(strip, first.astype(np.float32), cv2.TM_CCOEFF_NORMED)[0]
+    return Corner(
+        pixel=pixel,
+        partner=partner,
+        patches=np.stack([first, _patch(images[1], partner, radius)]),
+        columns=names,
+        correlations=found.astype(np.float64),
+        end=float(np.interp(partner[0], places, names)),
+    )
+
+
+def _patch(image: ImageArray, pixel: FloatArray, radius: int) -> FloatArray:
+    size, (u, v) = 2 * radius + 1, pixel
+    patch = cv2.getRectSubPix(image, (size, size), (float(u), float(v)), patchType=cv2.CV_32F)
+    return np.asarray(patch, dtype=np.float64)

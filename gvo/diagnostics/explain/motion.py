@@ -1,0 +1,213 @@
+"""How the frame was registered: the attempts repeated by the front-end's own functions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+
+from gvo.config import Config
+from gvo.diagnostics.explain.extraction import as_mask, distance_tests
+from gvo.diagnostics.explain.values import Registration, Sorting
+from gvo.frontend.calibration import Measurements
+from gvo.frontend.descriptor import DescriptorFrontend, is_step
+from gvo.frontend.klt import KltFrontend
+from gvo.frontend.matching import compare_within, predict_pixels
+from gvo.frontend.registration import find_consensus
+from gvo.frontend.tracking import WINDOW_RADIUS_PX
+from gvo.geometry import se3
+from gvo.geometry.camera import StereoCamera
+from gvo.geometry.correspondences import Correspondences
+from gvo.geometry.residuals import StereoResiduals, whiten_in_place
+from gvo.types import BoolArray, Contradiction, Failure, FloatArray, MotionPrior, RelativePose
+
+OwnFrontend: TypeAlias = KltFrontend | DescriptorFrontend
+"""The front-ends whose steps are known."""
+
+_MIN_DEPTH_M = 1e-3
+
+
+class Asked(NamedTuple):
+    """Arguments and result of a registration."""
+
+    reference: Any
+    current: Any
+    prior: MotionPrior | None
+    result: RelativePose | Failure
+
+
+class Attempt(NamedTuple):
+    """One way to find the points of a reference: from where, and how widely."""
+
+    prior: MotionPrior | None
+    is_wide: bool
+    measured: Measurements
+
+
+def explain_registration(
+    frontend: OwnFrontend, asked: Asked, camera: StereoCamera, config: Config
+) -> tuple[Registration, tuple[str, ...]]:
+    """Repeat a registration step by step; also describe its attempts, one a line.
+
+    The same arguments give the same result, so what is shown is what happened.
+    """
+    attempts = list(_attempts(frontend, asked, config))
+    prior, is_wide, _ = attempts[-1]
+    measured = frontend.measure(asked.reference, asked.current, prior, is_wide=is_wide)
+    if isinstance(frontend, KltFrontend):
+        radius_px = float(WINDOW_RADIUS_PX)
+        matches = _sort_tracks(frontend, asked, attempts[-1])
+        start = None if is_wide else prior
+    else:
+        radius_px = config.temporal.wide_radius_px if is_wide else config.temporal.radius_px
+        matches = _sort_descriptors(asked, prior, measured, radius_px, camera, config)
+        start = prior
+    found = _find_motion(frontend, measured, start, asked.result, camera, config)
+    words = [_describe(frontend, attempt) for attempt in attempts]
+    answers = [*map(_outcome, attempts[:-1]), _answer(asked.result)]
+    is_predicted = prior is not None and not np.array_equal(prior.T_predicted, np.eye(4))
+    registration = Registration(
+        matches=matches, radius_px=radius_px, is_predicted=is_predicted, **found
+    )
+    return registration, tuple(map(": ".join, zip(words, answers, strict=True)))
+
+
+def _attempts(frontend: OwnFrontend, asked: Asked, config: Config) -> Iterator[Attempt]:
+    """Yield the attempts of a front-end, up to the one that found the result's pixels."""
+    given = asked.reference, asked.current
+    ways = [(asked.prior, True)]
+    if asked.prior is not None:
+        ways.insert(0, (asked.prior, False))
+    for prior, is_wide in ways:
+        measured = frontend.measure(*given, prior, is_wide=is_wide)
+        yield Attempt(prior, is_wide, measured)
+        if _is_end(measured, asked.result):
+            return
+    start = None if isinstance(frontend, KltFrontend) else asked.prior
+    step = isinstance(frontend, KltFrontend) or is_step(asked.prior)
+    rough = frontend.calibrated.register(measured, config, prior=start, is_step=step)
+    # Descriptors of the whole image may have found it, too; their motion is near the result.
+    known = rough or asked.result
+    if isinstance(known, RelativePose):
+        found = MotionPrior(T_predicted=known.T_reference_current)
+        yield Attempt(found, False, frontend.measure(*given, found, is_wide=False))
+
+
+def _is_end(measured: Measurements, result: RelativePose | Failure) -> bool:
+    if isinstance(result, Failure):
+        return isinstance(result, Contradiction)
+    return np.array_equal(measured.uvd[1][:, :2], result.pixels_current)
+
+
+def _sort_tracks(frontend: KltFrontend, asked: Asked, attempt: Attempt) -> Sorting:
+    T = np.eye(4) if attempt.prior is None else attempt.prior.T_predicted
+    expected = frontend.predict(T, asked.reference, asked.current)
+    search = "wide" if attempt.is_wide else "near"
+    pixels, is_tracked = frontend.find_tracks(asked.reference, asked.current, expected, search)
+    n = len(asked.reference)
+    tracked = expected.indices[is_tracked]
+    found, predicted = np.full((n, 2), np.nan), np.full((n, 2), np.nan)
+    found[tracked], predicted[expected.indices] = pixels[is_tracked], expected.uvd[:, :2]
+    tests = {
+        "out of view": as_mask(expected.indices, n),
+        "track lost": as_mask(tracked, n),
+        "no disparity or depth": as_mask(attempt.measured.matches[:, 0], n),
+    }
+    source = asked.reference.keypoints
+    return Sorting(tests=tests, pixels=source, partners=found, predicted=predicted)
+
+
+def _sort_descriptors(
+    asked: Asked,
+    prior: MotionPrior | None,
+    measured: Measurements,
+    radius_px: float,
+    camera: StereoCamera,
+    config: Config,
+) -> Sorting:
+    reference, current, matches = asked.reference, asked.current, measured.matches
+    expected = predict_pixels(reference, None if prior is None else prior.T_predicted, camera)
+    tried = compare_within(reference, current, expected, radius_px)
+    n, limits = len(reference), config.temporal
+    found, predicted = np.full((n, 2), np.nan), np.full((n, 2), np.nan)
+    found[matches[:, 0]] = current.keypoints[matches[:, 1]]
+    predicted[expected[1]] = expected[0]
+    tests = {
+        "behind the camera": as_mask(expected[1], n),
+        "none within the radius": as_mask(tried[0][:, 0], n),
+        **distance_tests(*tried, n, max_distance=limits.max_distance, max_ratio=limits.max_ratio),
+        "reciprocity": as_mask(matches[:, 0], n),
+    }
+    return Sorting(tests=tests, pixels=reference.keypoints, partners=found, predicted=predicted)
+
+
+def _find_motion(
+    frontend: OwnFrontend,
+    measured: Measurements,
+    prior: MotionPrior | None,
+    result: RelativePose | Failure,
+    camera: StereoCamera,
+    config: Config,
+) -> dict[str, Any]:
+    """Return the consensus of the matches, and their residuals before and after."""
+    step = isinstance(frontend, KltFrontend) or is_step(prior)
+    T_start = frontend.calibrated.begin(measured, config, prior=prior, is_step=step)
+    matches = frontend.calibrated.prepare(measured, T_start)
+    if T_start is None and prior is not None:
+        T_start = se3.invert(prior.T_predicted)
+    first, second = measured.frames
+    stamps_ns = first.stamp_ns, second.stamp_ns
+    consensus = find_consensus(matches, camera, config, stamps_ns, T_start)
+    is_failed = isinstance(consensus, Failure)
+    offset = [0.0, 0.0, frontend.rig_offsets.disparity_px]
+    moved = np.abs(matches.target_uvd - (measured.uvd[1] - offset))
+    motion: dict[str, Any] = {
+        "consensus": 0 if is_failed else int(np.count_nonzero(consensus.inliers)),
+        "is_known": not is_failed and consensus.T_target_source is T_start,
+        "inliers": np.zeros(len(matches), np.bool_) if is_failed else consensus.inliers,
+        "residuals_px": None,
+        "whitened": None,
+        "row_motion_px": float(moved.max(initial=0.0)),
+    }
+    if is_failed or isinstance(result, Failure):
+        return motion
+    ends = consensus.T_target_source, se3.invert(result.T_reference_current)
+    residuals_px = np.stack([_residuals(T, matches, camera) for T in ends])
+    known = StereoResiduals.of(ends[0], matches, camera, huber=config.registration.huber)
+    whitened = np.stack([_whiten(each, known) for each in residuals_px])
+    inliers: BoolArray = result.inliers
+    return motion | {"inliers": inliers, "residuals_px": residuals_px, "whitened": whitened}
+
+
+def _residuals(T: FloatArray, matches: Correspondences, camera: StereoCamera) -> FloatArray:
+    points = se3.transform_points(T, matches.source_points)
+    points[points[:, 2] < _MIN_DEPTH_M] = np.nan
+    return np.asarray(matches.target_uvd - camera.project_stereo(points))
+
+
+def _whiten(residuals_px: FloatArray, residuals: StereoResiduals) -> FloatArray:
+    rows = residuals_px.T.copy()
+    whiten_in_place(residuals.columns[6:12], rows)
+    return np.ascontiguousarray(rows.T)
+
+
+def _describe(frontend: OwnFrontend, attempt: Attempt) -> str:
+    place = "previous" if attempt.prior is None else "predicted"
+    if not isinstance(frontend, KltFrontend):
+        size = "wide" if attempt.is_wide else "narrow"
+        return f"descriptors in the {size} window around the {place} pixels"
+    if attempt.is_wide:
+        return f"tracks from the {place} pixels, over more levels of the pyramid"
+    return f"tracks from the {place} pixels"
+
+
+def _outcome(attempt: Attempt) -> str:
+    """Tell what came of an attempt that another one followed."""
+    return "its motion is the prediction of the next" if attempt.is_wide else "not registered"
+
+
+def _answer(result: RelativePose | Failure) -> str:
+    if isinstance(result, Failure):
+        return result.reason
+    return f"registered, {result.n_inliers} inliers of {result.n_matches} matches"

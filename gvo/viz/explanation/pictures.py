@@ -1,0 +1,448 @@
+"""The six pictures of an explained frame."""
+
+from __future__ import annotations
+
+import textwrap
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from gvo.diagnostics.explain.values import FrameExplanation, Link, Sorting
+from gvo.frontend.klt import image_of
+from gvo.types import BoolArray, FloatArray, RelativePose, RgbdFrame, StereoFrame
+from gvo.viz.figures import (
+    Plot,
+    count_words,
+    draw_segments,
+    image_height,
+    is_wide,
+    join_images,
+    legend_below,
+    new_figure,
+    pair_height,
+    show_image,
+)
+from gvo.viz.palette import INLIERS, OUTLIERS, STAGES
+
+TITLES = {
+    "1_measured": "Keypoints with depth",
+    "2_flow": "Matches with the reference",
+    "3_corner": "One corner",
+    "3_candidates": "Why candidates failed",
+    "4_consensus": "Which matches agree on a motion",
+    "5_links": "Links to earlier frames",
+    "6_times": "Where the time went",
+}
+"""Of the pictures, by the names of their files."""
+_REASONS = ("#E69F00", "#D55E00", "#CC79A7", "#F0E442", "#0072B2", "#009E73", "#999999")
+_MARKERS = "xsD^vP+"
+_BEFORE, _AFTER, _LIMIT = "#999999", "#0072B2", "#D55E00"
+_N_COLUMNS = 4
+
+
+def draw_pictures(explanation: FrameExplanation) -> list[Plot]:
+    """Draw the steps that were reached, in order; say of the others why not."""
+    is_klt = explanation.config.frontend.kind == "klt"
+    return [
+        _draw_measured(explanation),
+        _draw_flow(explanation),
+        _draw_corner(explanation) if is_klt else _draw_candidates(explanation),
+        _draw_consensus(explanation),
+        _draw_links(explanation),
+        _draw_times(explanation),
+    ]
+
+
+def _picture(slug: str, text: str, figure: Figure | None = None) -> Plot:
+    return Plot(slug=slug, title=TITLES[slug], text=text, figure=figure, is_image=True)
+
+
+def _not_reached(slug: str, explanation: FrameExplanation) -> Plot:
+    why = explanation.result.reason or "this is the first frame, there is none to compare with"
+    return _picture(slug, f"Not reached: {why}.")
+
+
+def _draw_measured(explanation: FrameExplanation) -> Plot:
+    draw = _draw_disparities if isinstance(explanation.frame, StereoFrame) else _draw_depths
+    return draw(explanation)
+
+
+def _draw_disparities(explanation: FrameExplanation) -> Plot:
+    frame, measured = explanation.frame, explanation.measured
+    if not isinstance(frame, StereoFrame):
+        raise ValueError("disparities need a stereo frame")
+    kept, shape = measured.are_kept, frame.left.shape
+    heights = [pair_height(shape)]
+    if explanation.config.frontend.kind == "klt":
+        heights.append(image_height(shape, share=1.0 if is_wide(shape) else 0.6))
+    figure = new_figure(sum(heights) + 0.4)
+    rows = figure.subplots(len(heights), 1, height_ratios=heights, squeeze=False)
+    upper, *lower = rows[:, 0]
+    canvas, shift = join_images(frame.left, frame.right)
+    show_image(upper, canvas, f"left and right: {kept.sum()} matches, by disparity")
+    pixels, disparities = measured.pixels[kept], measured.values[kept]
+    # A single wrong match must not take all the colours.
+    low, high = np.percentile(disparities, [1, 97]) if kept.any() else (0.0, 1.0)
+    looks: dict[str, Any] = {"cmap": "viridis", "clim": (low, high), "linewidths": 0.9}
+    ends = measured.partners[kept] + shift
+    lines = draw_segments(upper, pixels, ends, array=disparities, **looks)
+    upper.scatter(*pixels.T, s=9, c=disparities, cmap="viridis", vmin=low, vmax=high)
+    if kept.any():
+        figure.colorbar(
+            lines, ax=upper, fraction=0.02, pad=0.01, extend="max", label="disparity [px]"
+        )
+    for axes in lower:  # those of descriptors have a picture of their own
+        show_image(axes, frame.left, "corners without a match, by the first test that they failed")
+        _draw_reasons(axes, measured)
+        legend_below(figure, axes)
+    return _picture("1_measured", _disparity_words(explanation), figure)
+
+
+def _disparity_words(explanation: FrameExplanation) -> str:
+    config, camera = explanation.config.stereo, explanation.camera
+    low, high = (camera.depth_to_disparity(z) for z in (config.max_depth_m, config.min_depth_m))
+    how = (
+        f"A match lies on the row of its keypoint (within {config.row_tolerance_px:g} px), has "
+        f"about its octave and a descriptor distance of at most {config.max_distance:g}; each is "
+        "the best of the other."
+    )
+    if explanation.config.frontend.kind == "klt":
+        how = (
+            "Each corner is searched along its row by correlation, then to a fraction of a pixel; "
+            "left and right must look alike there."
+        )
+    return (
+        f"Of {len(explanation.measured)} keypoints: {count_words(explanation.measured.counts())}. "
+        f"{how} The depth limits of {config.max_depth_m:g} and {config.min_depth_m:g} m are "
+        f"disparities of {low:.1f} and {high:.1f} px. Learnt of the rig before this frame: "
+        f"disparities are off by {explanation.offset_px:+z.3f} px, rows of the right image by "
+        f"{explanation.row_offset_px:+z.3f} px."
+    )
+
+
+def _draw_depths(explanation: FrameExplanation) -> Plot:
+    frame, measured, config = explanation.frame, explanation.measured, explanation.config.depth
+    if not isinstance(frame, RgbdFrame):
+        raise ValueError("a depth image needs an RGB-D frame")
+    figure = new_figure(image_height(frame.depth.shape, share=0.5) + 0.7)
+    first, second = figure.subplots(1, 2)
+    finite = frame.depth[np.isfinite(frame.depth)]
+    top = float(np.percentile(finite, 99)) if len(finite) else 1.0
+    depth = np.ma.masked_invalid(frame.depth)
+    show_image(first, depth, "depth (white: unknown)", cmap="viridis_r", vmin=0.0, vmax=top)
+    figure.colorbar(first.images[0], ax=first, fraction=0.04, pad=0.01, label="depth [m]")
+    show_image(second, frame.image, "keypoints: with depth, and the first test the others failed")
+    kept = measured.pixels[measured.are_kept]
+    first.plot(*kept.T, "o", color="white", mec="black", markersize=3.0, mew=0.5)
+    label = f"with depth: {len(kept)}"
+    second.plot(*kept.T, "o", color=INLIERS, markersize=4.0, mfc="none", label=label)
+    _draw_reasons(second, measured)
+    legend_below(figure, second)
+    words = (
+        f"Of {len(measured)} keypoints: {count_words(measured.counts())}. Valid depth is known, "
+        f"lies between {config.min_depth_m:g} and {config.max_depth_m:g} m (depth.min_depth_m, "
+        f"depth.max_depth_m) and varies by at most {100 * config.max_edge_step:g} % within "
+        f"{config.edge_radius_px} px (depth.max_edge_step): at an edge, a shift of a pixel between "
+        "colour and depth moves a point by far."
+    )
+    return _picture("1_measured", words, figure)
+
+
+def _draw_reasons(axes: Axes, sorting: Sorting, pixels: FloatArray | None = None) -> None:
+    """Mark the pixels dropped, or others in their place, by the first test that they failed."""
+    places, counts = sorting.pixels if pixels is None else pixels, sorting.counts()
+    for number, name in enumerate(sorting.names[:-1]):
+        if counts[name]:
+            axes.plot(
+                *places[sorting.are(name)].T,
+                color=_REASONS[number % len(_REASONS)],
+                marker=_MARKERS[number % len(_MARKERS)],
+                linestyle="none",
+                markersize=5.0,
+                label=f"{name}: {counts[name]}",
+            )
+
+
+def _draw_flow(explanation: FrameExplanation) -> Plot:
+    registration, reference = explanation.registration, explanation.reference
+    if registration is None or reference is None:
+        return _not_reached("2_flow", explanation)
+    matches, image = registration.matches, explanation.image
+    starts, ends = matches.pixels[matches.are_kept], matches.partners[matches.are_kept]
+    if explanation.config.frontend.kind == "klt":
+        share = 1.0 if is_wide(image.shape) else 0.75
+        figure = new_figure(image_height(image.shape, share=share) + 0.5)
+        axes = figure.subplots()
+        show_image(axes, image, "from where a point was in the reference to where it is now")
+        draw_segments(axes, starts, ends, colors=INLIERS)
+        axes.plot(*ends.T, ".", color=INLIERS, markersize=5, label=f"kept: {len(ends)}")
+        _draw_reasons(axes, matches, matches.predicted)
+    else:
+        figure = new_figure(pair_height(image.shape) + 0.5)
+        axes = figure.subplots()
+        canvas, shift = join_images(image_of(reference), image)
+        show_image(axes, canvas, "reference and current image")
+        draw_segments(axes, starts, ends + shift, colors=INLIERS, linewidths=0.7)
+        axes.plot(*starts.T, ".", color=INLIERS, markersize=4, label=f"matched: {len(ends)}")
+    legend_below(figure, axes)
+    return _picture("2_flow", _flow_words(explanation, matches), figure)
+
+
+def _flow_words(explanation: FrameExplanation, matches: Sorting) -> str:
+    registration, numbers = explanation.registration, ""
+    if registration is None:
+        return ""
+    radius = registration.radius_px
+    place = "predicted" if registration.is_predicted else "previous"
+    how = f"Descriptors are compared within {radius:g} px of the {place} pixels."
+    if explanation.config.frontend.kind == "klt":
+        side = 2 * radius + 1
+        how = (
+            f"Windows of {side:g} x {side:g} px are tracked by Lucas-Kanade from the {place} "
+            "pixels, then measured in 3-D where they end; dropped points are marked where they "
+            "were expected."
+        )
+    kept = matches.are_kept
+    if kept.any():
+        flow, error = (
+            np.linalg.norm(matches.partners[kept] - each[kept], axis=1)
+            for each in (matches.pixels, matches.predicted)
+        )
+        numbers = (
+            f" Points move by {np.median(flow):.1f} px (median, at most {flow.max():.1f}); they "
+            f"are {np.median(error):.1f} px (median, at most {error.max():.1f}) from where they "
+            "were expected."
+        )
+    if explanation.readout_ms:
+        numbers += (
+            f" For a readout of {explanation.readout_ms:.1f} ms they are moved by at most "
+            f"{registration.row_motion_px:.2f} px to the middle of the exposure."
+        )
+    return (
+        f"Of {len(matches)} points of frame {explanation.reference_index}, the reference: "
+        f"{count_words(matches.counts())}. {how}{numbers}"
+    )
+
+
+def _draw_corner(explanation: FrameExplanation) -> Plot:
+    corner = explanation.corner
+    if corner is None:
+        return _picture("3_corner", "Not reached: no corner was kept.")
+    is_stereo = isinstance(explanation.frame, StereoFrame)
+    names = ("left", "right") if is_stereo else ("reference", "current image")
+    figure = new_figure(2.9)
+    first, second, third, curve = figure.subplots(1, 4, width_ratios=[1, 1, 1, 2.6])
+    low, high = float(corner.patches[0].min()), float(corner.patches[0].max())
+    for axes, patch, name in zip((first, second), corner.patches, names, strict=True):
+        show_image(axes, patch, name, vmin=low, vmax=high)
+    difference, limit = corner.patches[1] - corner.patches[0], 0.5 * max(high - low, 1.0)
+    looks: dict[str, Any] = {"vmin": -limit, "vmax": limit}
+    show_image(third, difference - difference.mean(), "difference (grey: none)", **looks)
+    curve.plot(corner.columns, corner.correlations, color=_AFTER)
+    curve.axvline(corner.end, color=_LIMIT, linestyle="--")
+    what = "disparity [px]" if is_stereo else "pixels from the end of the track"
+    curve.set(xlabel=what, ylabel="correlation along the row", ylim=(-1.05, 1.05))
+    if is_stereo:
+        curve.invert_xaxis()
+    return _picture("3_corner", _corner_words(explanation, is_stereo=is_stereo), figure)
+
+
+def _corner_words(explanation: FrameExplanation, *, is_stereo: bool) -> str:
+    corner = explanation.corner
+    if corner is None:
+        return ""
+    (u, v), size = corner.pixel, len(corner.patches[0])
+    start = (
+        f"Of all corners kept, the one of the median horizontal gradient, at ({u:.0f}, {v:.0f}): "
+        f"its patch of {size} x {size} px in both images, their difference, and the correlation of "
+        "the first with the row of the second. "
+    )
+    if not is_stereo:
+        u, v = corner.partner
+        return f"{start}The track ends at ({u:.2f}, {v:.2f}), the dashed line."
+    offset_px = explanation.offset_px
+    depth = float(explanation.camera.disparity_to_depth(corner.end - offset_px))
+    return (
+        f"{start}The search ends at {corner.end:.3f} px, the dashed line"
+        + (f"; less the learnt {offset_px:+z.3f} px" if offset_px else "")
+        + f" that is a depth of {depth:.2f} m. A second peak as high means that the row repeats."
+    )
+
+
+def _draw_candidates(explanation: FrameExplanation) -> Plot:
+    """Mark the keypoints without a match, by the first test that all their candidates failed."""
+    image, registration = explanation.image, explanation.registration
+    shown = []
+    if isinstance(explanation.frame, StereoFrame):
+        shown.append(("in the right image", image, explanation.measured))
+    if registration is not None and explanation.reference is not None:
+        matches, reference = registration.matches, image_of(explanation.reference)
+        shown.append(("of the reference in this frame", reference, matches))
+    if not shown:
+        return _not_reached("3_candidates", explanation)
+    n_rows = len(shown) if is_wide(image.shape) else 1
+    n_columns = len(shown) // n_rows
+    share = 1.0 if is_wide(image.shape) else 0.5
+    figure = new_figure(n_rows * (image_height(image.shape, share=share) + 0.6))
+    parts = np.asarray(figure.subfigures(n_rows, n_columns, squeeze=False)).ravel()
+    words = []
+    for part, (where, background, sorting) in zip(parts, shown, strict=True):
+        axes = part.subplots()
+        show_image(axes, background, f"without a match {where}")
+        _draw_reasons(axes, sorting)
+        if axes.get_legend_handles_labels()[1]:
+            part.legend(loc="outside lower center", ncols=3, frameon=False)
+        words.append(f"{where}: {count_words(sorting.counts())}")
+    text = "Keypoints without a match, by the first test that all their candidates failed. "
+    return _picture("3_candidates", f"{text}{'; '.join(words).capitalize()}.", figure)
+
+
+def _draw_consensus(explanation: FrameExplanation) -> Plot:
+    registration, image = explanation.registration, explanation.image
+    if registration is None:
+        return _not_reached("4_consensus", explanation)
+    kept, inliers = registration.matches.are_kept, registration.inliers
+    starts, ends = registration.matches.pixels[kept], registration.matches.partners[kept]
+    height = image_height(image.shape, share=1.0 if is_wide(image.shape) else 0.6)
+    has_residuals = registration.residuals_px is not None
+    figure = new_figure(height + (3.0 if has_residuals else 0.3))
+    upper, *lower = (
+        figure.subfigures(2, 1, height_ratios=[height, 2.7]) if has_residuals else [figure]
+    )
+    axes = upper.subplots()
+    show_image(axes, image)
+    for chosen, colour, marker, name in (
+        (~inliers, OUTLIERS, "x", "disagree"),
+        (inliers, INLIERS, "o", "agree"),
+    ):
+        draw_segments(axes, starts[chosen], ends[chosen], colors=colour)
+        label = f"{name}: {chosen.sum()}"
+        axes.plot(*ends[chosen].T, marker, color=colour, markersize=4, label=label)
+    axes.legend(loc="upper right", frameon=True, framealpha=0.8)
+    for part in lower:
+        _draw_residuals(part.subplots(1, 4), explanation)
+    return _picture("4_consensus", _consensus_words(explanation, inliers), figure)
+
+
+def _draw_residuals(panels: Any, explanation: FrameExplanation) -> None:  # noqa: ANN401 - of axes
+    registration, gate = explanation.registration, explanation.config.registration.gate
+    if registration is None or registration.residuals_px is None or registration.whitened is None:
+        return
+    for column, name in enumerate(("u", "v", "disparity")):
+        values = registration.residuals_px[:, :, column]
+        finite = values[np.isfinite(values)]
+        reach = 1.1 * (float(np.percentile(np.abs(finite), 95)) if len(finite) else 1.0) + 1e-9
+        _compare(panels[column], values, np.linspace(-reach, reach, 31))
+        panels[column].set(xlabel=f"residual of {name} [px]")
+    panels[0].set_ylabel("matches")
+    panels[0].legend(loc="upper left")
+    lengths = np.nan_to_num(np.linalg.norm(registration.whitened, axis=2), nan=np.inf)
+    _compare(panels[3], lengths, np.linspace(0.0, 3.0 * gate, 31))
+    panels[3].axvline(gate, color=_LIMIT, linestyle="--", label=f"gate {gate:g}")
+    panels[3].set(xlabel="norm [sigma]")
+    panels[3].legend(loc="upper right")
+
+
+def _compare(axes: Axes, values: FloatArray, bins: FloatArray) -> None:
+    """Draw histograms of values before and after; the outer bins take what is beyond."""
+    for row, colour, name in ((0, _BEFORE, "before"), (1, _AFTER, "after")):
+        shown = np.clip(values[row][~np.isnan(values[row])], bins[0], bins[-1])
+        axes.hist(shown, bins.tolist(), histtype="stepfilled", alpha=0.6, color=colour, label=name)
+
+
+def _consensus_words(explanation: FrameExplanation, inliers: BoolArray) -> str:
+    registration, ransac = explanation.registration, explanation.config.ransac
+    if registration is None:
+        return ""
+    limit = f"{ransac.inlier_threshold_px:g} px in (u, v, disparity)"
+    if ransac.inlier_metric == "distance":
+        limit = f"{ransac.inlier_threshold_m:g} m"
+    text = f"A match agrees with a motion if its error is less than {limit}. "
+    if registration.is_known:
+        text += (
+            f"{registration.consensus} of {len(inliers)} agree with the predicted motion: RANSAC "
+            "was not needed. "
+        )
+    elif registration.consensus:
+        text += f"RANSAC found a motion with which {registration.consensus} agree. "
+    if registration.whitened is None:
+        return f"{text}No motion was accepted: {explanation.result.reason}."
+    found = registration.whitened[1][inliers]
+    rms = float(np.sqrt(np.nanmean(found**2)))
+    return (
+        f"{text}Below: measured less predicted, before the refinement and after it, the outer bins "
+        f"with all beyond; {inliers.sum()} inliers are left. In sigmas, from the noise of both "
+        f"frames, their root mean square is {rms:.2f}: 1 where the stated sigmas are right."
+    )
+
+
+def _draw_links(explanation: FrameExplanation) -> Plot:
+    links = explanation.links
+    if not links:
+        return _picture("5_links", "None: there is no earlier frame to link to.")
+    n_columns = min(_N_COLUMNS, max(len(links), 3))
+    n_rows = -(-len(links) // n_columns)
+    height = n_rows * (image_height(explanation.image.shape, share=1.0 / n_columns) + 0.4)
+    figure = new_figure(height)
+    panels = np.asarray(figure.subplots(n_rows, n_columns, squeeze=False)).ravel()
+    for axes, link in zip(panels, links, strict=False):
+        _draw_link(axes, link)
+    for axes in panels[len(links) :]:
+        axes.set_axis_off()
+    return _picture("5_links", _link_words(explanation), figure)
+
+
+def _draw_link(axes: Axes, link: Link) -> None:
+    what = {"step": "predecessor", "not linked": "keyframe, not linked"}.get(link.kind, link.kind)
+    answer, registration = link.reason, link.registration
+    show_image(axes, link.image)
+    if isinstance(registration, RelativePose):
+        pixels, inliers = registration.pixels_reference, registration.inliers
+        axes.plot(*pixels[~inliers].T, "x", color=OUTLIERS, markersize=3)
+        axes.plot(*pixels[inliers].T, ".", color=INLIERS, markersize=3)
+        chi2 = "" if link.chi2 is None else f", chi2 {link.chi2:.2f}"
+        counts = f"{registration.n_inliers} of {registration.n_matches} inliers"
+        answer = f"{counts}{chi2}, {'accepted' if link.is_accepted else 'refused'}"
+    colour = INLIERS if link.is_accepted else _BEFORE if link.kind == "not linked" else OUTLIERS
+    axes.spines[:].set(edgecolor=colour, linewidth=3)
+    head = f"frame {link.frame}, {what}, overlap {link.overlap:.2f}"
+    axes.set_title("\n".join([head, *textwrap.wrap(answer, 48)]), fontsize=8, loc="left")
+
+
+def _link_words(explanation: FrameExplanation) -> str:
+    window, links = explanation.config.window, explanation.links
+    text = (
+        f"Edges to earlier frames (blue): {sum(link.is_accepted for link in links)}; at most "
+        f"{window.n_links} keyframes are registered (window.n_links). Overlap is the share of its "
+        f"points in view; below {window.min_overlap:g} a keyframe is not linked "
+        f"(window.min_overlap). If every overlap is below {window.keyframe_overlap:g}, the frame "
+        "becomes a keyframe itself (window.keyframe_overlap), as this one "
+        f"{'did' if explanation.became_keyframe else 'did not'}. Chi2 is the squared residual of "
+        "the edge over its covariance, of 6 degrees of freedom: about 6 or less where the stated "
+        "covariances are right or cautious."
+    )
+    kinds = {link.kind for link in explanation.result.links if link.is_accepted}
+    if "depth" in kinds:
+        text += " Depth alone gave another edge to the predecessor (depth.icp)."
+    reasons = [f"frame {each.frame}: {each.reason}" for each in links if each.kind == "keyframe"]
+    refused = [each for each in reasons if not each.endswith(": ")]
+    return f"{text} Refused: {'; '.join(refused)}." if refused else text
+
+
+def _draw_times(explanation: FrameExplanation) -> Plot:
+    stages = explanation.result.stage_ms
+    figure = new_figure(0.9 + 0.28 * len(stages))
+    axes = figure.subplots()
+    colours = [STAGES.get(name, _BEFORE) for name in stages]
+    bars = axes.barh([*stages], [*stages.values()], color=colours, edgecolor="black", lw=0.5)
+    axes.bar_label(bars, fmt="%.1f ms", padding=3)
+    axes.invert_yaxis()
+    axes.set_xlabel("wall time [ms]")
+    axes.margins(x=0.1)
+    text = (
+        f"The stages of this frame took {sum(stages.values()):.1f} ms. The first frames of a "
+        "process take longer than others."
+    )
+    return _picture("6_times", text, figure)

@@ -1,0 +1,96 @@
+"""HTML pages in one file each: Jinja2 templates, one style sheet, no links to elsewhere."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections.abc import Mapping
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from gvo._text import visible
+from gvo.errors import ConfigurationError, write_faults
+from gvo.viz.names import PAGES, check_suffix
+
+
+def write_page(path: Path, template: str, **values: Any) -> None:  # noqa: ANN401 - any text
+    """Write an HTML page.
+
+    Parameters
+    ----------
+    path : Path
+        Replaced if it exists.
+    template : str
+        Name of a file beside this module that extends `base.html`.
+    **values
+        What the template names. Text is escaped by the template.
+
+    Raises
+    ------
+    ConfigurationError
+        When the suffix is not .html or .htm, or the file cannot be written.
+    """
+    check_suffix(path, PAGES)
+    page = _environment().get_template(template).render(values)
+    with write_faults(ConfigurationError, path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(page, encoding="utf-8", newline="\n")
+
+
+def part(name: str, *values: Any) -> Markup:  # noqa: ANN401 - any text
+    """Return a part of a page by the name of its macro in `parts.html`."""
+    template = _environment().get_template("parts.html")
+    return Markup(getattr(template.module, name)(*values))  # noqa: S704 - escaped by the macro
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("gvo.viz", "pages"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        finalize=_shown,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.globals.update(resource=_resource)
+    environment.filters.update(base64=lambda data: b64encode(data).decode(), yaml=_yaml)
+    return environment
+
+
+def _shown(value: Any) -> Any:  # noqa: ANN401
+    """Show characters that control or turn a text; what markup there is, is our own."""
+    return visible(value) if isinstance(value, str) and not isinstance(value, Markup) else value
+
+
+def _resource(name: str) -> Markup:
+    text = (files("gvo.viz.pages") / name).read_text(encoding="utf-8")
+    return Markup(text)  # noqa: S704 - a file of the package
+
+
+def _yaml(value: Any) -> str:  # noqa: ANN401
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) and abs(value) < 1e5 else str(value)
+
+
+def changes(
+    configuration: Mapping[str, Any], defaults: Mapping[str, Mapping[str, Any]]
+) -> dict[str, list[tuple[str, Any, bool, Any]]]:
+    """Return each parameter by section: key, value, whether it was changed, default."""
+    sections = {}
+    for name, section in configuration.items():
+        if isinstance(section, Mapping):
+            known = defaults.get(name, {})
+            sections[name] = [
+                (key, value, known.get(key, value) != value, known.get(key))
+                for key, value in section.items()
+            ]
+    return sections
