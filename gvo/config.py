@@ -41,6 +41,33 @@ _WIDEST_SLIDER = 1000.0
 _N_STEPS = 200
 # Parameters that there are no more, and the values at which they are fixed.
 _FIXED: Mapping[str, Value] = {
+    "check.fault_lost_share": 0.2,
+    "check.max_blur_px": 1.6,
+    "check.max_brightness": 230.0,
+    "check.max_clipped_share": 0.3,
+    "check.max_clock_drift_ms_per_min": 60.0,
+    "check.max_clock_jump_ms": 100.0,
+    "check.max_depth_difference_ms": 10.0,
+    "check.max_depth_median_m": 50.0,
+    "check.max_exposure_ratio": 1.3,
+    "check.max_gap_s": 0.5,
+    "check.max_jitter": 0.3,
+    "check.max_lens_k1": 0.15,
+    "check.max_lost_share": 0.05,
+    "check.max_misregistration_px": 3.0,
+    "check.max_negative_share": 0.1,
+    "check.max_row_offset_px": 0.75,
+    "check.max_row_spread_px": 2.0,
+    "check.max_stereo_difference_ms": 2.0,
+    "check.max_tf_gap_s": 0.5,
+    "check.max_unknown_depth": 0.5,
+    "check.min_brightness": 25.0,
+    "check.min_corners": 80,
+    "check.min_depth_in_range": 0.5,
+    "check.min_depth_levels": 64,
+    "check.min_depth_median_m": 0.2,
+    "check.min_followed_share": 0.3,
+    "check.min_stereo_matches": 60,
     "depth.icp": "auto",
     "depth.virtual_baseline_m": 0.075,
     "klt.cell_size_px": 40,
@@ -299,70 +326,9 @@ class RuntimeConfig(Section):
 
 
 class CheckConfig(Section):
-    """Samples and limits of `gvo check`."""
+    """Samples of `gvo check`."""
 
     n_samples: int = _expert(12, "frames sampled, each with its successor", ge=2, le=1000)
-    max_lost_share: float = _expert(
-        0.05, "maximum share of frames lost: dropped, unpaired, undecodable, repeated", ge=0, le=1
-    )
-    fault_lost_share: float = _expert(0.2, "share of frames lost that is a fault", ge=0, le=1)
-    max_jitter: float = _expert(
-        0.3, "maximum deviation of periods from their median, 95th percentile, relative to it", ge=0
-    )
-    max_gap_s: float = _expert(
-        0.5, "maximum time without a frame; above window.lost_after_s it is a fault", "s", gt=0
-    )
-    max_stereo_difference_ms: float = _expert(
-        2.0, "maximum median difference between the stamps of left and right", "ms", ge=0
-    )
-    max_depth_difference_ms: float = _expert(
-        10.0, "maximum median difference between the stamps of colour and depth", "ms", ge=0
-    )
-    max_clock_drift_ms_per_min: float = _expert(
-        60.0, "maximum drift of the header clock against the recording clock", "ms/min", ge=0
-    )
-    max_clock_jump_ms: float = _expert(
-        100.0, "maximum jump of the header clock against the recording clock", "ms", ge=0
-    )
-    max_row_offset_px: float = _expert(
-        0.75, "maximum median row difference of left and right; above it is a fault", "px", ge=0
-    )
-    max_row_spread_px: float = _expert(
-        2.0, "maximum 95th percentile of the row differences; above it is a fault", "px", ge=0
-    )
-    max_lens_k1: float = _expert(
-        0.15, "maximum radial distortion k1 left in rectified images; above it is a fault", ge=0
-    )
-    min_stereo_matches: int = _expert(60, "minimum matches of left and right per frame", ge=0)
-    max_negative_share: float = _expert(
-        0.1, "maximum share of negative disparities; above half: left and right swapped", ge=0, le=1
-    )
-    min_depth_median_m: float = _expert(0.2, "minimum median depth at a correct scale", "m", ge=0)
-    max_depth_median_m: float = _expert(50.0, "maximum median depth at a correct scale", "m", gt=0)
-    min_depth_in_range: float = _expert(
-        0.5, "minimum share of known depth in depth.min_depth_m to depth.max_depth_m", ge=0, le=1
-    )
-    max_unknown_depth: float = _expert(0.5, "maximum share of unknown depth", ge=0, le=1)
-    min_depth_levels: int = _expert(64, "minimum distinct values in a depth image", ge=1)
-    max_misregistration_px: float = _expert(
-        3.0, "maximum offset of depth edges from colour edges; above twice: a fault", "px", ge=0
-    )
-    min_brightness: float = _expert(25.0, "minimum mean grey value", "grey", ge=0, le=255)
-    max_brightness: float = _expert(230.0, "maximum mean grey value", "grey", ge=0, le=255)
-    max_clipped_share: float = _expert(
-        0.3, "maximum share of black and of white pixels", ge=0, le=1
-    )
-    max_exposure_ratio: float = _expert(
-        1.3, "maximum ratio of the mean grey values of left and right", ge=1
-    )
-    max_blur_px: float = _expert(1.6, "maximum blur of edges, as a sigma", "px", gt=0)
-    min_corners: int = _expert(80, "minimum corners per image (of klt.n_corners)", ge=0)
-    min_followed_share: float = _expert(
-        0.3, "minimum share of corners tracked into the next frame", ge=0, le=1
-    )
-    max_tf_gap_s: float = _expert(
-        0.5, "maximum time without a transform along a chain of frames", "s", gt=0
-    )
 
 
 class Config(Section):

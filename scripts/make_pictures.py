@@ -31,7 +31,8 @@ from gvo.odometry.odometry import Odometry
 from gvo.runs.demo import BAG_NAME, write_demo_bags
 from gvo.runs.outputs.options import RunOutputs
 from gvo.types import Frame
-from gvo.viz.explanation.extraction import draw_stereo
+from gvo.viz.explanation.pictures import draw_pictures
+from gvo.viz.figures import style
 from gvo.viz.overlay import compose_overlay
 from gvo.viz.report import write_run_report
 from gvo.viz.view import serve
@@ -104,8 +105,9 @@ def explain(task: Task) -> Picture:
     source = gvo.open_recording(task.bag)
     if source.info.sensor != "stereo":
         raise RecordingError(f"{task.bag}: expected a stereo recording, got {source.info.sensor}")
-    drawn = draw_stereo(explain_frame(source, task.frame, config=Config()))
-    return scaled(decoded(drawn.png or b""), 860)
+    with style():
+        measured = draw_pictures(explain_frame(source, task.frame, config=Config()))[0]
+        return scaled(decoded(measured.png()), 860)
 
 
 def report(task: Task) -> Picture:

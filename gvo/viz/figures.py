@@ -113,7 +113,7 @@ class Plot:
             raise ValueError(f"{self.slug} has no figure")
         buffer = io.BytesIO()
         with style(self.slug):
-            self.figure.savefig(buffer, format=suffix[1:], metadata=_METADATA[suffix])
+            _write(self.figure, buffer, suffix)
         return buffer.getvalue()
 
 
@@ -128,7 +128,13 @@ def save_figure(figure: Figure, path: Path) -> None:
     suffix = path.suffix.lower()
     with write_faults(TrajectoryError, path), style():
         path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, format=suffix[1:], dpi=150, metadata=_METADATA[suffix])
+        _write(figure, path, suffix, dpi=150)
+
+
+def _write(figure: Figure, to: Path | io.BytesIO, suffix: str, **options: Any) -> None:  # noqa: ANN401
+    figure.savefig(to, format=suffix[1:], metadata=_METADATA[suffix], **options)
+    # Laid out again it would differ a little.
+    figure.set_layout_engine("none")
 
 
 def write_plots(plots: Sequence[Plot], folder: Path) -> list[Path]:

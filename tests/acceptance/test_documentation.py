@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 import gvo
-from gvo.config import CheckConfig, Config, describe_configuration
+from gvo.config import Config, describe_configuration
+from gvo.diagnostics.check.limits import RULES
 from gvo.geometry.lens import N_COEFFICIENTS
 from gvo.io.bag.image_encodings import DEPTHS, IMAGES
 from gvo.io.bag.reader import BagReader
@@ -157,10 +158,10 @@ def test_all_encodings_and_lenses_are_listed() -> None:
     assert missing == []
 
 
-def test_all_thresholds_of_a_check_are_listed() -> None:
+def test_all_lines_of_a_check_are_listed() -> None:
     page = (ROOT / "docs/check.md").read_text()
-    names = [*CheckConfig.model_fields]
-    assert [name for name in names if not re.search(rf"`(check\.)?{name}`", page)] == []
+    names = [rule.removeprefix("transform ") for rule in RULES]
+    assert [name for name in names if not re.search(rf"`[^`]*\b{name}`", page)] == []
 
 
 def test_all_topics_of_the_bag_of_a_run_are_listed(workplace: Path, command: Command) -> None:

@@ -27,7 +27,7 @@ from tests.conftest import (
     refused,
     start,
 )
-from tests.viz.explanation.test_explanation import RGBD, STEREO
+from tests.viz.explanation.test_explanation import DESCRIPTORS, TRACKS
 
 COMMANDS = (
     *("demo", "run", "check", "smooth", "compare", "convert", "config"),
@@ -240,7 +240,7 @@ def test_a_stereo_frame_is_explained_as_the_run_tracked_it(
     run = tmp_path / "run"
     command("run", drive_bag, "--out", run, "--duration", "0.5", "--no-report")
     answer = command("explain", drive_bag, "--frame", "4", "--out", tmp_path / "out")
-    numbers = check_explanation(answer, tmp_path / "out", STEREO)
+    numbers = check_explanation(answer, tmp_path / "out", TRACKS)
     row = (run / "frames.csv").read_text().splitlines()[1 + 4].split(",")
     assert numbers["frame"] == 4
     assert numbers["status"] == row[1]
@@ -261,7 +261,7 @@ def test_a_stereo_frame_is_explained_as_the_run_tracked_it(
 def test_a_frame_is_explained_by_depth(command: Command, room_bag: Path, tmp_path: Path) -> None:
     options = ["--frame", "2", "--every", "2", "--set", "frontend.kind=descriptor"]
     answer = command("explain", room_bag, *options, "--out", tmp_path)
-    numbers = check_explanation(answer, tmp_path, RGBD)
+    numbers = check_explanation(answer, tmp_path, DESCRIPTORS)
     assert numbers["configuration"]["frontend"]["kind"] == "descriptor"
     assert numbers["stamp_ns"] - FIRST_NS == pytest.approx(2 * 2 * 1e9 / 30.0, abs=1.0)
     assert numbers["stereo"] is None

@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from gvo._trace import Event, watched
 from gvo.config import RegistrationConfig
 from gvo.geometry import se3
 from gvo.geometry.correspondences import Correspondences
@@ -166,14 +165,7 @@ def test_a_direction_is_open_beyond_100000_sigmas(inflation: float, is_open: boo
     assert isinstance(found, Failure if is_open else Refinement)
 
 
-# The rounds of a refinement, as told to whoever watches.
-
-
-def steps_before_and_after(events: list[Event]) -> tuple[int, int]:
-    """Return how many steps were made before and after the inliers were chosen again."""
-    names = [event.name for event in events]
-    gated = names.index("refinement.gated")
-    return names[:gated].count("refinement.step"), names[gated:].count("refinement.step")
+# The rounds of a refinement.
 
 
 def test_the_first_round_has_two_steps_and_the_second_ten() -> None:
@@ -182,9 +174,18 @@ def test_the_first_round_has_two_steps_and_the_second_ten() -> None:
     # So far away, and so narrow a kernel, that no step is small.
     config = RegistrationConfig(huber=0.01, gate=1e6)
     start = se3.exp(np.full(6, 0.05)) @ T
-    with watched() as events:
-        refine_pose(start, matches, all_of(matches), CAMERA, config)
-    assert steps_before_and_after(events) == (2, 10)
+    found = refine_pose(start, matches, all_of(matches), CAMERA, config)
+    assert isinstance(found, Refinement)
+    residuals = StereoResiduals.of(start, matches, CAMERA, huber=config.huber)
+    ends = []
+    for n_first, n_second in ((2, 10), (2, 9), (1, 10)):
+        rough = descend(start, residuals, n_iterations=n_first)
+        assert rough is not None
+        end = descend(rough, residuals, n_iterations=n_second)
+        assert end is not None
+        ends.append(se3.normalize(end))
+    are_equal = [np.array_equal(found.T_target_source, end) for end in ends]
+    assert are_equal == [True, False, False]
 
 
 def test_steps_end_where_they_are_a_thirtieth_of_a_sigma() -> None:
@@ -194,10 +195,10 @@ def test_steps_end_where_they_are_a_thirtieth_of_a_sigma() -> None:
     for start_sigmas, n_steps in ((0.02, 1), (0.05, 2), (0.9, 2)):
         direction = np.linalg.solve(np.linalg.cholesky(sums.H).T, np.eye(6)[0])
         start = se3.exp(start_sigmas * direction) @ T
-        with watched() as events:
-            refine_pose(start, matches, all_of(matches), CAMERA, SETTINGS)
-        first, _ = steps_before_and_after(events)
-        assert first == n_steps
+        residuals = StereoResiduals.of(start, matches, CAMERA, huber=HUBER)
+        ends = [descend(start, residuals, n_iterations=n) for n in range(n_steps - 1, 5)]
+        assert not np.array_equal(ends[0], ends[1])  # type: ignore[arg-type]
+        assert all(np.array_equal(ends[1], end) for end in ends[2:])  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("n_wrong", "n_kept"), [(0, 10), (10, 10), (11, 10), (12, 22), (25, 35)])

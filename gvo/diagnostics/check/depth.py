@@ -11,9 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gvo.config import CheckConfig, Config
-from gvo.diagnostics.check.findings import Finding, Limits, measured, unknown
+from gvo.config import Config
+from gvo.diagnostics.check.findings import Finding, unknown
 from gvo.diagnostics.check.images import check_frozen
+from gvo.diagnostics.check.limits import MAX_DEPTH_MEDIAN_M, measured
 from gvo.diagnostics.check.sampling import Sample
 from gvo.frontend.rgbd import sample_depth
 from gvo.frontend.tracking import detect_corners
@@ -232,66 +233,54 @@ def check_depth(samples: Sequence[Sample], config: Config) -> Iterator[Finding]:
     the images: the scene is five times as large and moves five times as far. Only ground truth, or
     a median depth that no scene has, reveals it.
     """
-    check = config.check
     frames = [sample.first for sample in samples if isinstance(sample.first, RgbdFrame)]
     if not frames:
         yield unknown("depth: median", "no depth image to look at")
         return
     depths = [frame.depth for frame in frames]
-    yield _check_scale(depths, check)
+    yield _check_scale(depths)
     yield _check_range(depths, config)
-    yield _check_holes(depths, check)
+    yield _check_holes(depths)
     yield _check_corners(frames, config)
-    yield _check_levels(depths, check)
+    yield _check_levels(depths)
     pairs = [
         (sample.first.depth, sample.second.depth)
         for sample in samples
         if isinstance(sample.first, RgbdFrame) and isinstance(sample.second, RgbdFrame)
     ]
     if pairs:
-        yield check_frozen("depth", pairs, check)
-    yield _check_registration(frames, check)
+        yield check_frozen("depth", pairs)
+    yield _check_registration(frames)
 
 
-def _check_scale(depths: Sequence[DepthArray], check: CheckConfig) -> Finding:
+def _check_scale(depths: Sequence[DepthArray]) -> Finding:
     medians = [float(np.nanmedian(depth)) for depth in depths]
     median_m = float(np.median(medians))
-    direction = "higher" if median_m > check.max_depth_median_m else "lower"
+    direction = "higher" if median_m > MAX_DEPTH_MEDIAN_M else "lower"
     return measured(
-        "depth: scale",
+        "scale",
         median_m,
-        Limits(fault_low=check.min_depth_median_m, fault_high=check.max_depth_median_m),
-        unit="m",
+        stream="depth",
         text=f"median {median_m:.3g} m, of images {min(medians):.3g} .. {max(medians):.3g} m",
         fix=f"set depth.scale (counts per metre: 1000 for mm, 5000 for TUM) {direction}",
     )
 
 
 def _check_range(depths: Sequence[DepthArray], config: Config) -> Finding:
-    check = config.check
     low, high = config.depth.min_depth_m, config.depth.max_depth_m
     known = [depth[np.isfinite(depth)] for depth in depths]
     share = float(np.median([np.mean((depth >= low) & (depth <= high)) for depth in known]))
     return measured(
-        "depth: within limits",
+        "within limits",
         share,
-        Limits(low=check.min_depth_in_range, fault_low=0.1 * check.min_depth_in_range),
-        unit="%",
+        stream="depth",
         text=f"{share:.1%} of the known depth within {low:g} .. {high:g} m",
-        fix="check depth.scale, then depth.min_depth_m and depth.max_depth_m",
     )
 
 
-def _check_holes(depths: Sequence[DepthArray], check: CheckConfig) -> Finding:
+def _check_holes(depths: Sequence[DepthArray]) -> Finding:
     share = float(np.median([np.mean(~np.isfinite(depth)) for depth in depths]))
-    return measured(
-        "depth: unknown",
-        share,
-        Limits(high=check.max_unknown_depth, fault_high=0.5 * (1.0 + check.max_unknown_depth)),
-        unit="%",
-        text=f"{share:.1%} of the pixels",
-        fix="sunlight, dark or shiny surfaces, or too near: depth is missing there",
-    )
+    return measured("unknown", share, stream="depth", text=f"{share:.1%} of the pixels")
 
 
 def _check_corners(frames: Sequence[RgbdFrame], config: Config) -> Finding:
@@ -301,28 +290,21 @@ def _check_corners(frames: Sequence[RgbdFrame], config: Config) -> Finding:
         corners = detect_corners(frame.image, config.klt.n_corners)
         counts.append(int(np.count_nonzero(sample_depth(frame.depth, corners, config.depth)[1])))
     return measured(
-        "depth: corners with depth",
+        "corners with depth",
         float(np.median(counts)),
-        Limits(low=config.check.min_stereo_matches, fault_low=config.ransac.min_inliers),
+        stream="depth",
+        fault_low=config.ransac.min_inliers,
         text=f"{np.median(counts):.0f} per frame (median)",
-        fix="more light or texture, nearer things; depth that is noisy, full of holes, out of "
-        "range or not registered to colour is of no use at corners",
     )
 
 
-def _check_levels(depths: Sequence[DepthArray], check: CheckConfig) -> Finding:
+def _check_levels(depths: Sequence[DepthArray]) -> Finding:
     levels = [np.unique(depth[np.isfinite(depth)]) for depth in depths]
     count = float(np.median([len(values) for values in levels]))
     steps = [_step_at_median(values) for values in levels]
     known = [step for step in steps if math.isfinite(step)]
     step_text = f", steps of {1e3 * float(np.median(known)):.3g} mm at the median" if known else ""
-    return measured(
-        "depth: levels",
-        count,
-        Limits(low=check.min_depth_levels, fault_low=0.25 * check.min_depth_levels),
-        text=f"{count:.0f} per image{step_text}",
-        fix="record 16UC1 or 32FC1: depth of 8 bits, or constant, is of no use",
-    )
+    return measured("levels", count, stream="depth", text=f"{count:.0f} per image{step_text}")
 
 
 def _step_at_median(values: DepthArray) -> float:
@@ -332,22 +314,18 @@ def _step_at_median(values: DepthArray) -> float:
     return float(np.median(np.diff(near))) if len(near) > 1 else math.nan
 
 
-def _check_registration(frames: Sequence[RgbdFrame], check: CheckConfig) -> Finding:
-    name = "depth: misregistration"
+def _check_registration(frames: Sequence[RgbdFrame]) -> Finding:
     found = estimate_misregistration(frames)
     if isinstance(found, Failure):
-        return unknown(name, found.reason)
+        return unknown("depth: misregistration", found.reason)
     parts = [
         f"{axis} {shift:+.1f}" if math.isfinite(shift) else f"{axis} unknown"
         for axis, shift in zip("uv", found.shift_px, strict=True)
     ]
     zoom = "" if found.zoom == 1.0 else f", zoom {found.zoom:.2f}"
     return measured(
-        name,
+        "misregistration",
         found.rms_px,
-        Limits(high=check.max_misregistration_px, fault_high=2.0 * check.max_misregistration_px),
-        unit="px",
+        stream="depth",
         text=f"{found.rms_px:.1f} px (depth to colour: {', '.join(parts)}{zoom})",
-        fix="register depth to colour: record the depth camera's CameraInfo and tf, or switch on "
-        "the driver's registration; late stamps look alike",
     )

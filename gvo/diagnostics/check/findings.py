@@ -9,7 +9,6 @@ from itertools import takewhile
 from typing import Literal, TypeAlias
 
 from gvo._text import format_table, visible
-from gvo.config import CheckConfig
 
 Verdict: TypeAlias = Literal["ok", "warning", "fault", "info", "unknown"]
 _N_DIGITS = 3
@@ -152,40 +151,6 @@ class Limits:
         return f"{text} {unit}".strip()
 
 
-def measured(
-    name: str, value: float, limits: Limits, *, unit: str = "", fix: str = "", text: str = ""
-) -> Finding:
-    """Compare a number with limits.
-
-    Parameters
-    ----------
-    name : str
-    value : float
-        NaN: unknown.
-    limits : Limits
-    unit : str
-        Unit of value and limits; "%": both are shares in [0, 1], shown in percent.
-    fix : str
-        What to do if the value is outside.
-    text : str
-        Shown in place of the number, if not empty.
-
-    Returns
-    -------
-    Finding
-    """
-    verdict = limits.judge(value)
-    return Finding(
-        name=name,
-        value=float(value) * (100.0 if unit == "%" else 1.0),
-        unit=unit,
-        text=text,
-        threshold=limits.describe(unit),
-        verdict=verdict,
-        fix=fix if verdict in ("warning", "fault") else "",
-    )
-
-
 def judged(
     name: str, value: str, *, is_ok: bool, threshold: str, fix: str, otherwise: Verdict = "warning"
 ) -> Finding:
@@ -209,13 +174,6 @@ def judged(
         verdict="ok" if is_ok else otherwise,
         fix="" if is_ok else fix,
     )
-
-
-def lost(name: str, n: int, n_frames: int, check: CheckConfig, fix: str, how: str = "") -> Finding:
-    """Compare the share of frames that are lost, for whatever reason, with its limits."""
-    limits = Limits(high=check.max_lost_share, fault_high=check.fault_lost_share)
-    text = f"{n} of {n_frames}{how}"
-    return measured(name, n / n_frames, limits, unit="%", text=text, fix=fix)
 
 
 def unknown(name: str, reason: str) -> Finding:

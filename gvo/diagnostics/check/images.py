@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gvo.config import CheckConfig, Config
-from gvo.diagnostics.check.findings import Finding, Limits, lost, measured, unknown
+from gvo.config import Config
+from gvo.diagnostics.check.findings import Finding, unknown
+from gvo.diagnostics.check.limits import MAX_BLUR_PX, lost, measured
 from gvo.diagnostics.check.sampling import Sample
 from gvo.frontend.tracking import detect_corners
 from gvo.types import (
@@ -42,7 +43,7 @@ _MIN_TORN_SHARE = 0.05
 _MIN_TORN_ROWS = 4
 
 
-def check_usable(samples: Sequence[Sample], check: CheckConfig) -> Iterator[Finding]:
+def check_usable(samples: Sequence[Sample]) -> Iterator[Finding]:
     """Yield the share of the sampled frames that odometry cannot use, with the first reason."""
     frames = [frame for sample in samples for frame in (sample.first, sample.second)]
     looked_at = [frame for frame in frames if frame is not None]
@@ -51,7 +52,7 @@ def check_usable(samples: Sequence[Sample], check: CheckConfig) -> Iterator[Find
         yield unknown("frames that cannot be used", "no frame to look at")
         return
     fix = faulty[0].reason if faulty else ""
-    yield lost("frames that cannot be used", len(faulty), len(looked_at), check, fix)
+    yield lost("frames that cannot be used", len(faulty), len(looked_at), fix)
 
 
 def check_images(samples: Sequence[Sample], config: Config) -> Iterator[Finding]:
@@ -67,12 +68,12 @@ def check_images(samples: Sequence[Sample], config: Config) -> Iterator[Finding]
             for sample in usable
             if sample.second is not None and not isinstance(sample.second, FaultyFrame)
         ]
-        yield from _check_exposure(name, images, config.check)
-        yield from _check_sharpness(name, images, config.check)
+        yield from _check_exposure(name, images)
+        yield from _check_sharpness(name, images)
         yield from _check_texture(name, images, pairs, config)
-        yield from _check_transfer(name, images, pairs, config)
+        yield from _check_transfer(name, images, pairs)
     if is_stereo:
-        yield _compare_exposures([_grey_images(sample.first) for sample in usable], config.check)
+        yield _compare_exposures([_grey_images(sample.first) for sample in usable])
 
 
 def blur_sigma_px(image: ImageArray) -> float:
@@ -151,68 +152,53 @@ def n_torn_rows(image: ImageArray) -> int:
     return n_rows - 1 - int(is_varied[-1]) if len(is_varied) else n_rows
 
 
-def check_frozen(
-    name: str, pairs: Sequence[tuple[ImageArray | DepthArray, ...]], check: CheckConfig
-) -> Finding:
+def check_frozen(name: str, pairs: Sequence[tuple[ImageArray | DepthArray, ...]]) -> Finding:
     """Count the images that equal the one before."""
     n_frozen = sum(np.array_equal(before, now, equal_nan=True) for before, now in pairs)
     fix = f"the driver repeats {name} images: record at the camera's own rate"
     how = " are the same as the one before"
-    return lost(f"{name}: frozen images", n_frozen, len(pairs), check, fix, how)
+    return lost(f"{name}: frozen images", n_frozen, len(pairs), fix, how)
 
 
-def _check_exposure(
-    name: str, images: Sequence[ImageArray], check: CheckConfig
-) -> Iterator[Finding]:
-    yield measured(
-        f"{name}: brightness",
-        float(np.median([image.mean() for image in images])),
-        Limits(low=check.min_brightness, high=check.max_brightness),
-        unit="grey",
-        fix="set exposure and gain of the camera, or light the scene",
-    )
+def _check_exposure(name: str, images: Sequence[ImageArray]) -> Iterator[Finding]:
+    brightness = float(np.median([image.mean() for image in images]))
+    yield measured("brightness", brightness, stream=name)
     black = float(np.median([np.mean(image <= _BLACK) for image in images]))
     white = float(np.median([np.mean(image >= _WHITE) for image in images]))
     yield measured(
-        f"{name}: clipped pixels",
+        "clipped pixels",
         max(black, white),
-        Limits(high=check.max_clipped_share),
-        unit="%",
+        stream=name,
         text=f"{black:.1%} black, {white:.1%} white",
         fix=f"{'longer' if black > white else 'shorter'} exposure: clipped pixels hold no corners",
     )
 
 
-def _check_sharpness(
-    name: str, images: Sequence[ImageArray], check: CheckConfig
-) -> Iterator[Finding]:
+def _check_sharpness(name: str, images: Sequence[ImageArray]) -> Iterator[Finding]:
     blurs = np.array([blur_sigma_px(image) for image in images])
     known = blurs[np.isfinite(blurs)]
     if len(known) == 0:
         yield unknown(f"{name}: blur", "no edges")
         return
-    share = float(np.mean(known > check.max_blur_px))
+    share = float(np.mean(known > MAX_BLUR_PX))
     yield measured(
-        f"{name}: blur",
+        "blur",
         float(np.median(known)),
-        Limits(high=check.max_blur_px),
-        unit="px",
+        stream=name,
         text=f"{np.median(known):.2f} px, {share:.0%} of frames above",
-        fix="focus the lens; shorter exposure where the camera moves fast",
     )
 
 
 def _check_texture(
     name: str, images: Sequence[ImageArray], pairs: Sequence[tuple[ImageArray, ...]], config: Config
 ) -> Iterator[Finding]:
-    check = config.check
     counts = [len(detect_corners(image, config.klt.n_corners)) for image in images]
     yield measured(
-        f"{name}: corners",
+        "corners",
         float(np.median(counts)),
-        Limits(low=check.min_corners, fault_low=config.ransac.min_inliers),
+        stream=name,
+        fault_low=config.ransac.min_inliers,
         text=f"{np.median(counts):.0f} median, {min(counts)} least of {config.klt.n_corners}",
-        fix="more light, texture or contrast in view",
     )
     if not pairs:
         yield unknown(f"{name}: corners found again", "no two consecutive frames")
@@ -222,38 +208,31 @@ def _check_texture(
         for first, second in pairs
     ]
     yield measured(
-        f"{name}: corners found again",
+        "corners found again",
         float(np.median(shares)),
-        Limits(low=check.min_followed_share),
-        unit="%",
+        stream=name,
         text=f"{np.median(shares):.0%} in the next frame",
-        fix="higher frame rate or slower motion; check that frames are in order",
     )
 
 
 def _check_transfer(
-    name: str, images: Sequence[ImageArray], pairs: Sequence[tuple[ImageArray, ...]], config: Config
+    name: str, images: Sequence[ImageArray], pairs: Sequence[tuple[ImageArray, ...]]
 ) -> Iterator[Finding]:
     if pairs:
-        yield check_frozen(name, pairs, config.check)
+        yield check_frozen(name, pairs)
     torn = np.array([n_torn_rows(image) for image in images])
     # Rectification leaves a border without pixels, the same in all images.
     limit = max(_MIN_TORN_ROWS, _MIN_TORN_SHARE * images[0].shape[0])
     n_torn = int(np.count_nonzero(torn - torn.min() > limit))
     fix = "transfers break off: lower rate or size, another cable or port"
     how = " end in rows of one value"
-    yield lost(f"{name}: torn images", n_torn, len(images), config.check, fix, how)
+    yield lost(f"{name}: torn images", n_torn, len(images), fix, how)
 
 
-def _compare_exposures(pairs: Sequence[tuple[ImageArray, ...]], check: CheckConfig) -> Finding:
+def _compare_exposures(pairs: Sequence[tuple[ImageArray, ...]]) -> Finding:
     ratios = [(left.mean() + 1.0) / (right.mean() + 1.0) for left, right in pairs]
     ratio = float(np.median(ratios))
-    return measured(
-        "left/right: brightness ratio",
-        ratio,
-        Limits(low=1.0 / check.max_exposure_ratio, high=check.max_exposure_ratio),
-        fix="let both cameras share exposure and gain",
-    )
+    return measured("brightness ratio", ratio, stream="left/right")
 
 
 def _gradients(image: ImageArray, sigma_px: float) -> FloatArray:

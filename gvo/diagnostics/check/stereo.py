@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from gvo.config import CheckConfig, Config
-from gvo.diagnostics.check.findings import Finding, Limits, judged, measured, unknown
+from gvo.config import Config
+from gvo.diagnostics.check.findings import Finding, judged, unknown
 from gvo.diagnostics.check.images import follow
+from gvo.diagnostics.check.limits import MIN_STEREO_MATCHES, measured
 from gvo.diagnostics.check.sampling import Sample
 from gvo.frontend.features import FeatureExtractor, Features
 from gvo.frontend.matching import descriptor_distances, mutual_best
@@ -250,7 +251,6 @@ def check_stereo(
     samples: Sequence[Sample], camera: PinholeCamera, config: Config
 ) -> Iterator[Finding]:
     """Yield the findings on the matches of left and right."""
-    check = config.check
     pairs = [sample.first for sample in samples if isinstance(sample.first, StereoFrame)]
     if not pairs:
         yield unknown("left/right: matches", "no stereo frame to look at")
@@ -259,41 +259,39 @@ def check_stereo(
     found = [matcher.match(frame.left, frame.right) for frame in pairs]
     count = float(np.median([len(matches) for matches in found]))
     yield measured(
-        "left/right: matches",
+        "matches",
         count,
-        Limits(low=check.min_stereo_matches, fault_low=config.ransac.min_inliers),
+        stream="left/right",
+        fault_low=config.ransac.min_inliers,
         text=f"{count:.0f} per frame (median)",
-        fix="make sure that the topics are of one pair, in focus, lit and textured",
     )
     matches = FreeMatches.joined(found)
-    if len(matches) < check.min_stereo_matches:
+    if len(matches) < MIN_STEREO_MATCHES:
         yield unknown("left/right: rows", f"{len(matches)} matches are too few")
         return
-    yield from _check_rows(matches, check)
-    yield _check_lens(matches, camera, check)
-    yield _check_order(matches, check)
+    yield from _check_rows(matches)
+    yield _check_lens(matches, camera)
+    yield _check_order(matches)
     yield _check_step(samples, matcher)
 
 
-def _check_rows(matches: FreeMatches, check: CheckConfig) -> Iterator[Finding]:
+def _check_rows(matches: FreeMatches) -> Iterator[Finding]:
     error = row_error(matches)
     fix = (
         "calibrate the pair anew, or check R and P and that the topic is as (un)rectified as its "
         "CameraInfo says"
     )
     yield measured(
-        "left/right: row offset",
+        "row offset",
         error.median_px,
-        Limits(fault_low=-check.max_row_offset_px, fault_high=check.max_row_offset_px),
-        unit="px",
+        stream="left/right",
         text=f"{error.median_px:+z.2f} px median",
         fix=fix,
     )
     yield measured(
-        "left/right: row spread",
+        "row spread",
         error.percentile_95_px,
-        Limits(fault_high=check.max_row_spread_px),
-        unit="px",
+        stream="left/right",
         text=f"{error.percentile_95_px:.2f} px at 95 %",
         fix=fix,
     )
@@ -305,31 +303,28 @@ def _check_rows(matches: FreeMatches, check: CheckConfig) -> Iterator[Finding]:
     )
 
 
-def _check_lens(matches: FreeMatches, camera: PinholeCamera, check: CheckConfig) -> Finding:
+def _check_lens(matches: FreeMatches, camera: PinholeCamera) -> Finding:
     error = lens_error(matches, camera)
     if isinstance(error, Failure):
         return unknown("left/right: lens distortion", error.reason)
     return measured(
-        "left/right: lens distortion",
+        "lens distortion",
         error.k1,
-        Limits(fault_low=-check.max_lens_k1, fault_high=check.max_lens_k1),
+        stream="left/right",
         text=f"k1 of about {error.k1:+z.2f} is left, sigma {error.sigma:.3f}",
-        fix="the images are raw or wrongly calibrated: choose the raw topics with their D, or give "
-        "a --calibration FILE with D",
     )
 
 
-def _check_order(matches: FreeMatches, check: CheckConfig) -> Finding:
+def _check_order(matches: FreeMatches) -> Finding:
     disparities = matches.disparities
     sure = disparities[np.abs(disparities) > _SIGN_PX]
-    share = float(np.mean(sure < 0)) if len(sure) >= check.min_stereo_matches else math.nan
+    share = float(np.mean(sure < 0)) if len(sure) >= MIN_STEREO_MATCHES else math.nan
     is_swapped = share > 0.5
     median_px = float(np.median(disparities))
     return measured(
-        "left/right: order",
+        "order",
         share,
-        Limits(high=check.max_negative_share, fault_high=0.5),
-        unit="%",
+        stream="left/right",
         text=f"{share:.1%} of the disparities are negative, median {median_px:+.1f} px",
         fix="exchange --left and --right"
         if is_swapped

@@ -9,8 +9,14 @@ from itertools import groupby, takewhile
 
 import numpy as np
 
-from gvo.config import CheckConfig, Config
-from gvo.diagnostics.check.findings import Finding, Limits, lost, measured, unknown
+from gvo.config import Config
+from gvo.diagnostics.check.findings import Finding, unknown
+from gvo.diagnostics.check.limits import (
+    MAX_CLOCK_JUMP_MS,
+    STAMP_DIFFERENCES_MS,
+    lost,
+    measured,
+)
 from gvo.diagnostics.check.sampling import Sample, StreamStamps, Survey
 from gvo.errors import GvoError
 from gvo.frontend.klt import image_of
@@ -32,8 +38,6 @@ _DRIFT_SIGMAS = 4.0
 # do with each other have differences of any size up to there.
 _MAX_SHARE_OF_PERIOD = 0.4
 _MIN_SHARE_OF_PERIOD = 0.1
-# A period outside is mostly one in a wrong unit.
-_PERIODS_MS = (0.5, 10_000.0)
 _N_PARTS = 3
 _N_FRAMES = 30
 # Images of a stream may come so much later than those of the other.
@@ -53,7 +57,7 @@ def check_timing(survey: Survey, info: RecordingInfo, config: Config) -> Iterato
         yield from _check_stream(name, stream.stamps_ns, config)
     yield from _check_pairs(survey, info, config)
     for name, stream in zip(names, survey.streams, strict=True):
-        yield from _check_clock(name, stream, config.check)
+        yield from _check_clock(name, stream)
 
 
 def _check_stream(name: str, stamps_ns: IntArray, config: Config) -> Iterator[Finding]:
@@ -72,7 +76,7 @@ def _check_stream(name: str, stamps_ns: IntArray, config: Config) -> Iterator[Fi
     if np.median(stamps_ns) == 0:
         fix = "the driver stamps nothing: --set sync.stamps=recording takes the bag's clock"
     how = " repeat or go back"
-    yield lost(f"{name}: stamps", n_bad, len(stamps_ns), config.check, fix, how)
+    yield lost(f"{name}: stamps", n_bad, len(stamps_ns), fix, how)
     forward = steps_ns[steps_ns > 0]
     if len(forward) < 2:
         yield unknown(f"{name}: period", f"{len(stamps_ns)} images")
@@ -82,26 +86,21 @@ def _check_stream(name: str, stamps_ns: IntArray, config: Config) -> Iterator[Fi
 
 def _check_rate(name: str, steps_s: FloatArray, n: int, config: Config) -> Iterator[Finding]:
     period_s = float(np.median(steps_s))
-    low_ms, high_ms = _PERIODS_MS
     yield measured(
-        f"{name}: period",
+        "period",
         1e3 * period_s,
-        Limits(low=low_ms, high=high_ms),
-        unit="ms",
+        stream=name,
         text=f"{1e3 * period_s:.3g} ms ({1 / period_s:.4g} Hz)"
         if period_s < 1e-3
         else f"{1e3 * period_s:.2f} ms ({1 / period_s:.2f} Hz)",
-        fix="stamps are in another unit than seconds and nanoseconds: mend the driver",
     )
     regular = steps_s[steps_s < 1.5 * period_s]
     jitter_s = float(np.percentile(np.abs(regular - period_s), 95))
     yield measured(
-        f"{name}: jitter",
+        "jitter",
         jitter_s / period_s,
-        Limits(high=config.check.max_jitter),
-        unit="%",
+        stream=name,
         text=f"{1e3 * jitter_s:.3g} ms, {jitter_s / period_s:.1%} of the period",
-        fix="stamp at the exposure in the driver, not where messages arrive",
     )
     yield from _check_gaps(name, steps_s, n, config)
 
@@ -111,16 +110,15 @@ def _check_gaps(name: str, steps_s: FloatArray, n: int, config: Config) -> Itera
     gaps_s = steps_s[steps_s > _GAP_PERIODS * period_s]
     longest_s = float(gaps_s.max(initial=0.0))
     yield measured(
-        f"{name}: gaps",
+        "gaps",
         longest_s,
-        Limits(high=config.check.max_gap_s, fault_high=config.window.lost_after_s),
-        unit="s",
+        stream=name,
+        fault_high=config.window.lost_after_s,
         text=f"{len(gaps_s)}, longest {longest_s:.3g} s" if len(gaps_s) else "",
-        fix="find what stalled the recording (disk, bandwidth); odometry coasts over it",
     )
     n_dropped = int(np.sum(np.maximum(np.rint(steps_s / period_s) - 1, 0)))
     fix = "record with more bandwidth or a smaller rate; every dropped frame widens the motion"
-    yield lost(f"{name}: dropped frames", n_dropped, n + n_dropped, config.check, fix)
+    yield lost(f"{name}: dropped frames", n_dropped, n + n_dropped, fix)
 
 
 def _check_pairs(survey: Survey, info: RecordingInfo, config: Config) -> Iterator[Finding]:
@@ -132,22 +130,19 @@ def _check_pairs(survey: Survey, info: RecordingInfo, config: Config) -> Iterato
         signed_ms = -_nearest_differences(second, first) / 1e6
     else:
         signed_ms = _nearest_differences(first, second) / 1e6
-    yield _check_difference(signed_ms, info, config.check)
+    yield _check_difference(signed_ms, info)
     yield _check_partners(survey, np.abs(signed_ms), info, config)
 
 
-def _check_difference(signed_ms: FloatArray, info: RecordingInfo, check: CheckConfig) -> Finding:
+def _check_difference(signed_ms: FloatArray, info: RecordingInfo) -> Finding:
     sizes_ms = np.abs(signed_ms)
     typical_ms, signed = float(np.median(sizes_ms)), float(np.median(signed_ms))
-    is_stereo = info.sensor == "stereo"
-    limit_ms = check.max_stereo_difference_ms if is_stereo else check.max_depth_difference_ms
     return measured(
-        f"{'/'.join(info.stream_names)}: stamp difference",
+        "stamp difference",
         typical_ms,
-        Limits(high=limit_ms),
-        unit="ms",
+        stream="/".join(info.stream_names),
         text=f"{typical_ms:.3g} ms median ({signed:+.3g} signed), {sizes_ms.max():.3g} ms largest",
-        fix="trigger both by hardware; a shared offset of the clocks is to be taken off the stamps",
+        high=STAMP_DIFFERENCES_MS[info.sensor],
     )
 
 
@@ -168,7 +163,7 @@ def _check_partners(
     else:
         fix = f"images of one stream are missing: see dropped frames and gaps of {name}"
     how = f" at sync.{key}={limit_ms:g}"
-    return lost(f"{name}: frames without partner", n_alone, n_frames, config.check, fix, how)
+    return lost(f"{name}: frames without partner", n_alone, n_frames, fix, how)
 
 
 def _period_ms(stamps_ns: IntArray) -> float:
@@ -185,7 +180,7 @@ def _nearest_differences(first_ns: IntArray, second_ns: IntArray) -> FloatArray:
     return np.asarray(np.where(is_before, to_before, to_after), dtype=np.float64)
 
 
-def _check_clock(name: str, stream: StreamStamps, check: CheckConfig) -> Iterator[Finding]:
+def _check_clock(name: str, stream: StreamStamps) -> Iterator[Finding]:
     """Compare the header stamps with the times of recording.
 
     Messages are late at random, now and then very late. So medians over stretches of the recording
@@ -200,12 +195,10 @@ def _check_clock(name: str, stream: StreamStamps, check: CheckConfig) -> Iterato
         name=f"{name}: recording clock",
         value=f"{_duration_text(float(np.median(offsets_ms)))} after the header",
     )
-    yield from _check_drift(name, elapsed_s, offsets_ms, check)
+    yield from _check_drift(name, elapsed_s, offsets_ms)
 
 
-def _check_drift(
-    name: str, elapsed_s: FloatArray, offsets_ms: FloatArray, check: CheckConfig
-) -> Iterator[Finding]:
+def _check_drift(name: str, elapsed_s: FloatArray, offsets_ms: FloatArray) -> Iterator[Finding]:
     n_stretches = min(_N_STRETCHES, len(offsets_ms) // _MIN_PER_STRETCH)
     if n_stretches < _MIN_STRETCHES:
         yield unknown(f"{name}: clock drift", f"{len(offsets_ms)} images are too few")
@@ -214,21 +207,9 @@ def _check_drift(
     levels_ms = _medians(offsets_ms, n_stretches)
     steps_ms = np.diff(levels_ms)
     jump_ms = float(np.abs(steps_ms - np.median(steps_ms)).max())
-    yield measured(
-        f"{name}: clock jump",
-        jump_ms,
-        Limits(high=check.max_clock_jump_ms),
-        unit="ms",
-        fix="a clock was set, or recording stalled: keep time synchronisation from stepping it",
-    )
-    drift = 0.0 if jump_ms > check.max_clock_jump_ms else _drift(middles_s, levels_ms)
-    yield measured(
-        f"{name}: clock drift",
-        drift,
-        Limits(low=-check.max_clock_drift_ms_per_min, high=check.max_clock_drift_ms_per_min),
-        unit="ms/min",
-        fix="synchronise the camera's clock with the computer's (PTP, NTP)",
-    )
+    yield measured("clock jump", jump_ms, stream=name)
+    drift = 0.0 if jump_ms > MAX_CLOCK_JUMP_MS else _drift(middles_s, levels_ms)
+    yield measured("clock drift", drift, stream=name)
 
 
 def _medians(values: FloatArray, n_stretches: int) -> FloatArray:

@@ -89,7 +89,8 @@ def test_a_sweep_has_all_sections_and_its_totals(tmp_path: Path) -> None:
 
 def test_nothing_outside_is_referred_to_and_no_id_is_there_twice(tmp_path: Path) -> None:
     page = page_of(tmp_path, made_up(SWEEP, 3))
-    assert "runs" in page.assert_nothing_outside()
+    page.assert_nothing_outside()
+    assert "#runs" in page.links
     assert not {*page.tags} & {"script", "img", "iframe", "object", "base"}
 
 

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gvo.diagnostics.check import CheckResult, Finding, format_check
-from gvo.diagnostics.check.findings import Limits, measured
+from gvo.diagnostics.check.findings import Limits
+from gvo.diagnostics.check.limits import measured
 
 WORDS = st.text(st.characters(codec="ascii", categories=["L", "N"]), min_size=1, max_size=12)
 VERDICTS = st.sampled_from(["ok", "warning", "fault", "info", "unknown"])
@@ -76,14 +77,20 @@ def test_the_limits_themselves_are_still_within() -> None:
 
 
 def test_only_what_is_wrong_has_a_fix() -> None:
-    fine = measured("rows", 0.1, Limits(high=0.5), unit="px", fix="calibrate")
-    wrong = measured("rows", 0.7, Limits(high=0.5), unit="px", fix="calibrate")
-    assert (fine.fix, wrong.fix) == ("", "calibrate")
+    fine, wrong = (measured("row spread", value, fix="calibrate") for value in (0.1, 2.1))
+    assert (fine.verdict, fine.fix) == ("ok", "")
+    assert (wrong.verdict, wrong.fix) == ("fault", "calibrate")
 
 
 def test_shares_are_shown_in_percent() -> None:
-    finding = measured("lost", 0.25, Limits(high=0.05), unit="%", fix="record anew")
-    assert (finding.value_text, finding.threshold) == ("25 %", "<= 5 %")
+    finding = measured("jitter", 0.45, stream="left")
+    assert (finding.name, finding.value_text) == ("left: jitter", "45 %")
+    assert (finding.threshold, finding.verdict) == ("<= 30 %", "warning")
+
+
+def test_a_limit_may_come_from_the_configuration() -> None:
+    assert measured("corners", 20.0).verdict == "warning"
+    assert measured("corners", 20.0, fault_low=30.0).verdict == "fault"
 
 
 def test_warnings_alone_do_not_make_a_recording_unusable() -> None:

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gvo.config import CheckConfig
 from gvo.diagnostics.check.findings import Finding
 from gvo.diagnostics.check.frame_tree import check_frame_tree
 from gvo.io.poses.tf import TfBuffer
@@ -35,7 +34,7 @@ def tree(*, leave_out: str = "", moving_ns: Any = STAMPS_NS) -> TfBuffer:
 def look(
     buffer: TfBuffer, camera: str = "camera_optical", base: str = "base_link"
 ) -> dict[str, Finding]:
-    found = check_frame_tree(buffer, camera, STAMPS_NS, base_frame=base, check=CheckConfig())
+    found = check_frame_tree(buffer, camera, STAMPS_NS, base_frame=base)
     return {finding.name: finding for finding in found}
 
 

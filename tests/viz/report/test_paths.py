@@ -9,8 +9,8 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from gvo.trajectory.trajectory import Trajectory
+from gvo.viz.figures import style
 from gvo.viz.report.paths import World, lines_of, path_plots
-from gvo.viz.report.sheets import settings
 
 MAP_GRID = (512_345.2, 4_600_123.5, -33.0)
 
@@ -25,7 +25,7 @@ def test_numbers_and_labels_stay_in_the_picture_and_apart(
     T[:, :3, 3] = np.stack([np.sin(angles), np.cos(angles), 0.1 * angles], axis=1) * 10 * step_m
     T[:, :3, 3] += origin
     path = Trajectory(stamps_ns=np.arange(30) * 100_000_000, T_world_frame=T)
-    with settings():
+    with style():
         for plot in path_plots(lines_of(path, {"one": path}), World.of(path))[:2]:
             assert plot.figure is not None
             canvas: Any = FigureCanvasAgg(plot.figure)

@@ -1,0 +1,73 @@
+"""What figures share: gaps, lone points, labels, thinned paths."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gvo.geometry import se3
+from gvo.trajectory.evaluation import Consistency
+from gvo.trajectory.trajectory import Trajectory
+from gvo.viz.figures import broken, draw_curve, evenly, gaps_before, new_figure, style
+from gvo.viz.palette import Style
+from gvo.viz.report.paths import lines_of
+from gvo.viz.report.plots import covariance_plot
+
+
+def test_a_lone_point_between_gaps_is_drawn() -> None:
+    axes = new_figure(3.0).subplots()
+    y = np.array([1.0, np.nan, 2.0, np.nan, 3.0, 3.0])
+    draw_curve(axes, np.arange(6.0), y, Style(color="black"))
+    assert [np.asarray(line.get_xdata()).tolist() for line in axes.lines[1:]] == [[0.0, 2.0]]
+    assert axes.lines[1].get_marker() == "."
+
+
+@given(st.integers(2, 50), st.integers(1, 49))
+def test_a_line_is_broken_where_a_step_is_long(n: int, at: int) -> None:
+    at = min(at, n - 1)
+    seconds = np.arange(float(n))
+    seconds[at:] += 1000.0
+    points = broken(seconds, np.column_stack([seconds, seconds]))
+    if n > 2:  # of two poses, the step between them is the usual one
+        assert gaps_before(seconds).tolist() == [at]
+        assert np.flatnonzero(np.isnan(points[:, 0])).tolist() == [at]
+
+
+@given(st.integers(1, 10_000), st.integers(2, 500))
+def test_what_is_thinned_keeps_both_ends(n: int, n_most: int) -> None:
+    chosen = evenly(n, n_most)
+    assert len(chosen) == min(n, n_most)
+    assert (chosen[0], chosen[-1]) == (0, n - 1)
+    assert np.all(np.diff(chosen) > 0)
+
+
+@pytest.mark.parametrize(("n", "n_gaps"), [(0, 0), (1, 0), (2, 0), (100_000, 1)])
+def test_long_paths_become_short_ones_that_keep_their_gaps(n: int, n_gaps: int) -> None:
+    positions = np.arange(3.0 * n).reshape(n, 3)
+    stamps_ns = np.arange(n, dtype=np.int64) * 1_000_000_000
+    stamps_ns[60_000:] += 1_000_000_000_000
+    T = se3.make_transform(np.tile(np.eye(3), (n, 1, 1)), positions)
+    (line,) = lines_of(None, {"raw": Trajectory(stamps_ns=stamps_ns, T_world_frame=T)})
+    assert len(line.points) <= 6000
+    assert np.count_nonzero(np.isnan(line.points[:, 0])) == n_gaps
+    if n:
+        np.testing.assert_array_equal(line.points[[0, -1]], positions[[0, -1]])
+
+
+def test_no_label_of_errors_within_their_covariances_is_cut() -> None:
+    n = 100
+    end_ns = np.arange(n, dtype=np.int64) * 100_000_000 + 1_000_000_000
+    sigmas = np.array([1e-4, 1e-4, 1e-4, 2.88e-3, 2.88e-3, 2.88e-3])
+    item = Consistency(
+        name="raw over 1 s",
+        start_ns=end_ns - 1_000_000_000,
+        end_ns=end_ns,
+        errors=np.zeros((n, 6)),
+        covariances=np.tile(np.diag(sigmas**2), (n, 1, 1)),
+    )
+    with style():
+        figure = covariance_plot(item, 0).figure
+        assert figure is not None
+        figure.draw_without_rendering()  # type: ignore[no-untyped-call,unused-ignore]
+        lefts = [axes.yaxis.label.get_window_extent().x0 for axes in figure.axes]
+    assert min(lefts) > 0.0
