@@ -65,7 +65,8 @@ def style(salt: str = "gvo") -> Iterator[None]:
     salt : str
         Of the ids within SVG, which would be random without it.
     """
-    with rc_context({**_STYLE, "svg.hashsalt": salt}):
+    settings: Any = {**_STYLE, "svg.hashsalt": salt}  # names that are typed in newer Matplotlib
+    with rc_context(settings):
         yield
 
 
@@ -169,7 +170,7 @@ def legend_below(figure: Figure, axes: Axes) -> None:
     _legend(figure, axes, "outside lower center")
 
 
-def _legend(figure: Figure, axes: Axes, place: str) -> None:
+def _legend(figure: Figure, axes: Axes, place: Any) -> None:  # noqa: ANN401 - of matplotlib
     handles, labels = axes.get_legend_handles_labels()
     if not labels:
         return

@@ -1,6 +1,6 @@
 """Rendered recordings with exact ground truth."""
 
-from gvo.io.synthetic import SyntheticRecording
+from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.io.synthetic.rendering import StillScene
 from gvo.io.synthetic.scene import Light, Rectangle, make_scene
 from gvo.io.synthetic.sensor import SensorNoise

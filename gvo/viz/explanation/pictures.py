@@ -9,9 +9,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from gvo.diagnostics.explain.values import FrameExplanation, Link, Sorting
+from gvo.diagnostics.explain.values import (
+    Corner,
+    FrameExplanation,
+    Link,
+    Registration,
+    Sorting,
+)
 from gvo.frontend.klt import image_of
-from gvo.types import BoolArray, FloatArray, RelativePose, RgbdFrame, StereoFrame
+from gvo.types import FloatArray, RelativePose, RgbdFrame, StereoFrame
 from gvo.viz.figures import (
     Plot,
     count_words,
@@ -65,14 +71,14 @@ def _not_reached(slug: str, explanation: FrameExplanation) -> Plot:
 
 
 def _draw_measured(explanation: FrameExplanation) -> Plot:
-    draw = _draw_disparities if isinstance(explanation.frame, StereoFrame) else _draw_depths
-    return draw(explanation)
+    frame = explanation.frame
+    if isinstance(frame, StereoFrame):
+        return _draw_disparities(explanation, frame)
+    return _draw_depths(explanation, frame)
 
 
-def _draw_disparities(explanation: FrameExplanation) -> Plot:
-    frame, measured = explanation.frame, explanation.measured
-    if not isinstance(frame, StereoFrame):
-        raise ValueError("disparities need a stereo frame")
+def _draw_disparities(explanation: FrameExplanation, frame: StereoFrame) -> Plot:
+    measured = explanation.measured
     kept, shape = measured.are_kept, frame.left.shape
     heights = [pair_height(shape)]
     if explanation.config.frontend.kind == "klt":
@@ -122,10 +128,8 @@ def _disparity_words(explanation: FrameExplanation) -> str:
     )
 
 
-def _draw_depths(explanation: FrameExplanation) -> Plot:
-    frame, measured, config = explanation.frame, explanation.measured, explanation.config.depth
-    if not isinstance(frame, RgbdFrame):
-        raise ValueError("a depth image needs an RGB-D frame")
+def _draw_depths(explanation: FrameExplanation, frame: RgbdFrame) -> Plot:
+    measured, config = explanation.measured, explanation.config.depth
     figure = new_figure(image_height(frame.depth.shape, share=0.5) + 0.7)
     first, second = figure.subplots(1, 2)
     finite = frame.depth[np.isfinite(frame.depth)]
@@ -187,14 +191,11 @@ def _draw_flow(explanation: FrameExplanation) -> Plot:
         draw_segments(axes, starts, ends + shift, colors=INLIERS, linewidths=0.7)
         axes.plot(*starts.T, ".", color=INLIERS, markersize=4, label=f"matched: {len(ends)}")
     legend_below(figure, axes)
-    return _picture("2_flow", _flow_words(explanation, matches), figure)
+    return _picture("2_flow", _flow_words(explanation, registration), figure)
 
 
-def _flow_words(explanation: FrameExplanation, matches: Sorting) -> str:
-    registration, numbers = explanation.registration, ""
-    if registration is None:
-        return ""
-    radius = registration.radius_px
+def _flow_words(explanation: FrameExplanation, registration: Registration) -> str:
+    matches, radius, numbers = registration.matches, registration.radius_px, ""
     place = "predicted" if registration.is_predicted else "previous"
     how = f"Descriptors are compared within {radius:g} px of the {place} pixels."
     if explanation.config.frontend.kind == "klt":
@@ -246,20 +247,17 @@ def _draw_corner(explanation: FrameExplanation) -> Plot:
     curve.set(xlabel=what, ylabel="correlation along the row", ylim=(-1.05, 1.05))
     if is_stereo:
         curve.invert_xaxis()
-    return _picture("3_corner", _corner_words(explanation, is_stereo=is_stereo), figure)
+    return _picture("3_corner", _corner_words(explanation, corner), figure)
 
 
-def _corner_words(explanation: FrameExplanation, *, is_stereo: bool) -> str:
-    corner = explanation.corner
-    if corner is None:
-        return ""
+def _corner_words(explanation: FrameExplanation, corner: Corner) -> str:
     (u, v), size = corner.pixel, len(corner.patches[0])
     start = (
         f"Of all corners kept, the one of the median horizontal gradient, at ({u:.0f}, {v:.0f}): "
         f"its patch of {size} x {size} px in both images, their difference, and the correlation of "
         "the first with the row of the second. "
     )
-    if not is_stereo:
+    if isinstance(explanation.frame, RgbdFrame):
         u, v = corner.partner
         return f"{start}The track ends at ({u:.2f}, {v:.2f}), the dashed line."
     offset_px = explanation.offset_px
@@ -322,23 +320,24 @@ def _draw_consensus(explanation: FrameExplanation) -> Plot:
         axes.plot(*ends[chosen].T, marker, color=colour, markersize=4, label=label)
     axes.legend(loc="upper right", frameon=True, framealpha=0.8)
     for part in lower:
-        _draw_residuals(part.subplots(1, 4), explanation)
-    return _picture("4_consensus", _consensus_words(explanation, inliers), figure)
+        gate = explanation.config.registration.gate
+        _draw_residuals(part.subplots(1, 4), registration, gate)
+    return _picture("4_consensus", _consensus_words(explanation, registration), figure)
 
 
-def _draw_residuals(panels: Any, explanation: FrameExplanation) -> None:  # noqa: ANN401 - of axes
-    registration, gate = explanation.registration, explanation.config.registration.gate
-    if registration is None or registration.residuals_px is None or registration.whitened is None:
+def _draw_residuals(panels: Any, registration: Registration, gate: float) -> None:  # noqa: ANN401
+    residuals_px, whitened = registration.residuals_px, registration.whitened
+    if residuals_px is None or whitened is None:
         return
     for column, name in enumerate(("u", "v", "disparity")):
-        values = registration.residuals_px[:, :, column]
+        values = residuals_px[:, :, column]
         finite = values[np.isfinite(values)]
         reach = 1.1 * (float(np.percentile(np.abs(finite), 95)) if len(finite) else 1.0) + 1e-9
         _compare(panels[column], values, np.linspace(-reach, reach, 31))
         panels[column].set(xlabel=f"residual of {name} [px]")
     panels[0].set_ylabel("matches")
     panels[0].legend(loc="upper left")
-    lengths = np.nan_to_num(np.linalg.norm(registration.whitened, axis=2), nan=np.inf)
+    lengths = np.nan_to_num(np.linalg.norm(whitened, axis=2), nan=np.inf)
     _compare(panels[3], lengths, np.linspace(0.0, 3.0 * gate, 31))
     panels[3].axvline(gate, color=_LIMIT, linestyle="--", label=f"gate {gate:g}")
     panels[3].set(xlabel="norm [sigma]")
@@ -352,10 +351,8 @@ def _compare(axes: Axes, values: FloatArray, bins: FloatArray) -> None:
         axes.hist(shown, bins.tolist(), histtype="stepfilled", alpha=0.6, color=colour, label=name)
 
 
-def _consensus_words(explanation: FrameExplanation, inliers: BoolArray) -> str:
-    registration, ransac = explanation.registration, explanation.config.ransac
-    if registration is None:
-        return ""
+def _consensus_words(explanation: FrameExplanation, registration: Registration) -> str:
+    inliers, ransac = registration.inliers, explanation.config.ransac
     limit = f"{ransac.inlier_threshold_px:g} px in (u, v, disparity)"
     if ransac.inlier_metric == "distance":
         limit = f"{ransac.inlier_threshold_m:g} m"
