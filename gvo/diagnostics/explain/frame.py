@@ -155,7 +155,8 @@ class _Drive:
         links = tuple(self._links(asked, result, before))
         reference_ns = steps[-1].reference.stamp_ns if steps else None
         reference = None if reference_ns is None else before[reference_ns]
-        registration, attempts = None, ()
+        registration: Registration | None = None
+        attempts: tuple[str, ...] = ()
         if steps:
             registration, attempts = explain_registration(own, steps[-1], own.camera, config)
         return FrameExplanation(

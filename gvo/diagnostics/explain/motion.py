@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.residuals import StereoResiduals, whiten_in_place
-from gvo.types import BoolArray, Contradiction, Failure, FloatArray, MotionPrior, RelativePose
+from gvo.types import Contradiction, Failure, FloatArray, MotionPrior, RelativePose
 
 OwnFrontend: TypeAlias = KltFrontend | DescriptorFrontend
 """The front-ends whose steps are known."""
@@ -103,7 +103,7 @@ def _is_end(measured: Measurements, result: RelativePose | Failure) -> bool:
 def _sort_tracks(frontend: KltFrontend, asked: Asked, attempt: Attempt) -> Sorting:
     T = np.eye(4) if attempt.prior is None else attempt.prior.T_predicted
     expected = frontend.predict(T, asked.reference, asked.current)
-    search = "wide" if attempt.is_wide else "near"
+    search: Literal["wide", "near"] = "wide" if attempt.is_wide else "near"
     pixels, is_tracked = frontend.find_tracks(asked.reference, asked.current, expected, search)
     n = len(asked.reference)
     tracked = expected.indices[is_tracked]
@@ -159,25 +159,31 @@ def _find_motion(
     first, second = measured.frames
     stamps_ns = first.stamp_ns, second.stamp_ns
     consensus = find_consensus(matches, camera, config, stamps_ns, T_start)
-    is_failed = isinstance(consensus, Failure)
     offset = [0.0, 0.0, frontend.rig_offsets.disparity_px]
     moved = np.abs(matches.target_uvd - (measured.uvd[1] - offset))
     motion: dict[str, Any] = {
-        "consensus": 0 if is_failed else int(np.count_nonzero(consensus.inliers)),
-        "is_known": not is_failed and consensus.T_target_source is T_start,
-        "inliers": np.zeros(len(matches), np.bool_) if is_failed else consensus.inliers,
+        "consensus": 0,
+        "is_known": False,
+        "inliers": np.zeros(len(matches), np.bool_),
         "residuals_px": None,
         "whitened": None,
         "row_motion_px": float(moved.max(initial=0.0)),
     }
-    if is_failed or isinstance(result, Failure):
+    if isinstance(consensus, Failure):
         return motion
+    motion["consensus"] = int(np.count_nonzero(consensus.inliers))
+    motion["is_known"] = consensus.T_target_source is T_start
+    if isinstance(result, Failure):
+        return motion | {"inliers": consensus.inliers}
     ends = consensus.T_target_source, se3.invert(result.T_reference_current)
     residuals_px = np.stack([_residuals(T, matches, camera) for T in ends])
     known = StereoResiduals.of(ends[0], matches, camera, huber=config.registration.huber)
     whitened = np.stack([_whiten(each, known) for each in residuals_px])
-    inliers: BoolArray = result.inliers
-    return motion | {"inliers": inliers, "residuals_px": residuals_px, "whitened": whitened}
+    return motion | {
+        "inliers": result.inliers,
+        "residuals_px": residuals_px,
+        "whitened": whitened,
+    }
 
 
 def _residuals(T: FloatArray, matches: Correspondences, camera: StereoCamera) -> FloatArray:

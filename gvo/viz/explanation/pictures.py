@@ -306,9 +306,9 @@ def _draw_consensus(explanation: FrameExplanation) -> Plot:
     height = image_height(image.shape, share=1.0 if is_wide(image.shape) else 0.6)
     has_residuals = registration.residuals_px is not None
     figure = new_figure(height + (3.0 if has_residuals else 0.3))
-    upper, *lower = (
-        figure.subfigures(2, 1, height_ratios=[height, 2.7]) if has_residuals else [figure]
-    )
+    heights = [height, 2.7] if has_residuals else [height]
+    parts: Any = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)
+    upper, *lower = parts[:, 0]
     axes = upper.subplots()
     show_image(axes, image)
     for chosen, colour, marker, name in (
