@@ -78,16 +78,6 @@ def estimate_misregistration(frames: Sequence[RgbdFrame]) -> Misregistration | F
     moves the left and right steps of a thing towards each other, an offset moves both alike, so
     both are estimated together. Depth of another focal length (not registered at all) shows as a
     zoom, common to both axes.
-
-    Parameters
-    ----------
-    frames : sequence of RgbdFrame
-        Frames of one camera; many of them average out texture.
-
-    Returns
-    -------
-    Misregistration or Failure
-        Failure if there are too few steps of depth, or no peak stands out.
     """
     axes = [_collect(frames, axis) for axis in (1, 0)]
     has_enough = [min(len(each.offsets) for each in pair) >= _MIN_POINTS for pair in axes]
@@ -116,18 +106,7 @@ def estimate_misregistration(frames: Sequence[RgbdFrame]) -> Misregistration | F
 
 
 def depth_steps(depth: DepthArray) -> tuple[BoolArray, BoolArray]:
-    """Find the pixels next to which depth increases along a row.
-
-    Parameters
-    ----------
-    depth : ndarray of float32, shape (height, width)
-        Metres, NaN = unknown; a few unknown pixels between near and far are allowed.
-
-    Returns
-    -------
-    before, after : ndarray of bool, shape (height, width)
-        Far is right of the pixel; left of it.
-    """
+    """Find the pixels next to which depth increases along a row."""
     height, width = depth.shape
     is_known = np.isfinite(depth)
     columns = np.arange(width)

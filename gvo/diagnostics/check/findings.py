@@ -154,19 +154,7 @@ class Limits:
 def judged(
     name: str, value: str, *, is_ok: bool, threshold: str, fix: str, otherwise: Verdict = "warning"
 ) -> Finding:
-    """Return a finding that is ok or not.
-
-    Parameters
-    ----------
-    name, value, threshold : str
-        As of `Finding`.
-    is_ok : bool
-        Whether the verdict is "ok".
-    fix : str
-        What to do otherwise.
-    otherwise : {"warning", "fault"}
-        The verdict otherwise.
-    """
+    """Return a finding that is ok or not."""
     return Finding(
         name=name,
         value=value,

@@ -24,17 +24,6 @@ def check_frame_tree(
     """Yield what is missing between the camera, the robot's base and the root of their tree.
 
     Odometry itself needs no transforms; `--frame` and ground truth from `/tf` do.
-
-    Parameters
-    ----------
-    buffer : TfBuffer
-        Transforms of the recording.
-    camera_frame : str
-        Frame of the images' headers; may be empty.
-    stamps_ns : ndarray of int64, shape (n,)
-        Stamps of the images.
-    base_frame : str
-        The robot's own frame.
     """
     edges = buffer.edges - {(TRUTH_FRAMES.parent, TRUTH_FRAMES.child)}
     frames = {name for edge in edges for name in edge}

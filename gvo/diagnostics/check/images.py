@@ -83,16 +83,6 @@ def blur_sigma_px(image: ImageArray) -> float:
     1 / sqrt(s^2 + blur^2), whatever the contrast. So the blur follows from the ratio of the
     gradients at two scales: here the median over the strong local maxima of the gradient.
 
-    Parameters
-    ----------
-    image : ndarray of uint8, shape (height, width)
-
-    Returns
-    -------
-    float
-        0.3 to 1.3 for sharp cameras; NaN if the image has no edges. Too small for much blurred
-        edges of little contrast, in noise.
-
     References
     ----------
     S. Zhuo, T. Sim, "Defocus map estimation from a single image", Pattern Recognition 44(9),
@@ -112,15 +102,7 @@ def blur_sigma_px(image: ImageArray) -> float:
 
 
 def followed_share(first: ImageArray, second: ImageArray, corners: FloatArray) -> float:
-    """Return the share of corners that Lucas-Kanade tracks to the next image and back.
-
-    Parameters
-    ----------
-    first, second : ndarray of uint8, shape (height, width)
-        An image and the next one.
-    corners : ndarray of float64, shape (n, 2)
-        Pixels in the first image; corners of noise are not found again.
-    """
+    """Return the share of corners that Lucas-Kanade tracks to the next image and back."""
     if len(corners) == 0:
         return 0.0
     start = corners.astype(np.float32)

@@ -79,19 +79,7 @@ class Survey:
 
 
 def survey(source: Source, config: Config, *, n_samples: int) -> Survey:
-    """Read all stamps of a recording, and decode a sample of its frames as for odometry.
-
-    Parameters
-    ----------
-    source : Source
-    config : Config
-    n_samples : int
-        Number of decoded frames, each with its successor.
-
-    Returns
-    -------
-    Survey
-    """
+    """Read all stamps of a recording, and decode a sample of its frames as for odometry."""
     pass_ = _Pass(source, config.sync, n_samples)
     pass_.run()
     n_pairs = pass_.n_pairs

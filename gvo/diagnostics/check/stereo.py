@@ -175,18 +175,6 @@ def lens_error(matches: FreeMatches, camera: PinholeCamera) -> LensError | Failu
     at different radii, so its rows differ by fy y k1 (r_left^2 - r_right^2). Offset, scale and
     rotation of the rows, which make other patterns, are estimated together with k1.
 
-    Parameters
-    ----------
-    matches : FreeMatches
-        Matches of the rectified images.
-    camera : PinholeCamera
-        Camera of the left image.
-
-    Returns
-    -------
-    LensError or Failure
-        Failure if the matches do not determine k1: all far away, or near the centre.
-
     References
     ----------
     D. C. Brown, "Decentering distortion of lenses", Photogrammetric Engineering, 1966.

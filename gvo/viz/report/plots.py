@@ -141,14 +141,7 @@ def _curves(
 def drift_plot(
     comparisons: Sequence[Comparison], *, asked_m: Sequence[float] | None = None
 ) -> Plot:
-    """Return the drift by the length of segments.
-
-    Parameters
-    ----------
-    comparisons : sequence of Comparison
-    asked_m : sequence of float, optional
-        Lengths asked for, metres; lengths that suit the path where omitted.
-    """
+    """Return the drift by the length of segments."""
     path_m = max(float(c.reference.distances()[-1]) for c in comparisons)
     is_asked = asked_m is not None and tuple(asked_m) not in (KITTI_SEGMENTS_M, SHORT_SEGMENTS_M)
     lengths = tuple(asked_m) if asked_m is not None and is_asked else drift_lengths(path_m)
@@ -192,15 +185,7 @@ def _drift_figure(found: Sequence[tuple[str, Drift | None]]) -> Figure:
 
 
 def covariance_plot(item: Consistency, first_ns: int) -> Plot:
-    """Return errors of motions with their 3-sigma bands.
-
-    Parameters
-    ----------
-    item : Consistency
-        Of the raw chain over a second.
-    first_ns : int
-        Stamp of elapsed time zero.
-    """
+    """Return errors of motions with their 3-sigma bands."""
     inside = 100.0 * np.mean(np.abs(item.errors) <= _SIGMAS * item.sigmas, axis=0)
     return _plot(
         "covariance",
@@ -387,14 +372,7 @@ def _rate_words(timings: TimingTable, total: FloatArray) -> str:
 
 
 def edge_plots(edges: EdgeTable | None, first_ns: int) -> list[Plot]:
-    """Return the chi-square of the edges over time, and its histogram.
-
-    Parameters
-    ----------
-    edges : EdgeTable or None
-    first_ns : int
-        Stamp of elapsed time zero.
-    """
+    """Return the chi-square of the edges over time, and its histogram."""
     if edges is None or not np.any(np.isfinite(edges.chi2)):
         reason = "Not drawn: the run has no edges with residuals."
         return [_plot(slug, text=reason) for slug in ("chi2", "chi2_histogram")]
