@@ -230,7 +230,7 @@ def test_what_is_no_text_file_is_refused(tmp_path: Path) -> None:
 
 def test_a_folder_that_is_missing_is_named_when_writing(tmp_path: Path) -> None:
     trajectory = random_trajectory(0)
-    for write in (write_tum, write_kitti, write_covariances):
+    for write in (write_tum, write_kitti):
         with pytest.raises(TrajectoryError, match=r"nowhere.*cannot be written: No such file"):
             write(tmp_path / "nowhere" / "file.txt", trajectory)
 
