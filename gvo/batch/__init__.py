@@ -34,7 +34,7 @@ _MODULES = {
     "gvo.batch.tasks": ("BatchOptions",),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
-_NEEDED = ("dask", "distributed", "pandas", "pyarrow", "fsspec", "cryptography")
+_NEEDED = ("dask", "distributed", "pandas", "cryptography")
 
 __all__ = sorted(_MODULE_OF)
 

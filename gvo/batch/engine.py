@@ -20,7 +20,7 @@ from gvo.batch.tasks import BatchRow, Task, TaskOptions
 from gvo.batch.worker import work
 from gvo.errors import GvoError, missing_extra
 
-# An adaptive cluster grows with the tasks that it sees.
+# Tasks given to the cluster at once: an adaptive one grows with the tasks that it sees.
 _MIN_IN_FLIGHT = 100
 _PER_THREAD = 2
 _TICK_S = 0.2
@@ -28,7 +28,6 @@ _MAX_REASON = 500
 _CONNECT_S = "30s"
 # The statistical profiler keeps an hour of samples: megabytes for each run.
 _LOCAL_WORKERS = {"distributed.worker.profile.enabled": False}
-_COUNT_EVERY_S = 2.0
 _LOST = "the scheduler is gone; the same command goes on where the batch was"
 
 
@@ -49,12 +48,11 @@ class BatchProgress:
     n_failed : int
         Of those done, without a trajectory.
     n_workers : int
-    frames_per_s : float
-        Of all workers, since the start.
+        Workers of the cluster.
     left_s : float or None
-        Estimate of the time left; None before the first frame.
+        Estimate of the time left, seconds; None before the first run has ended.
     row : BatchRow or None
-        Of the run that has just ended.
+        Row of the run that has just ended.
     """
 
     n_done: int = 0
@@ -62,7 +60,6 @@ class BatchProgress:
     n_found: int = 0
     n_failed: int = 0
     n_workers: int = 0
-    frames_per_s: float = 0.0
     left_s: float | None = None
     row: BatchRow | None = None
 
@@ -76,7 +73,7 @@ def connected(scheduler: str | None, n_workers: int | None) -> Iterator[Client]:
     scheduler : str or None
         Its address, such as tcp://host:8786.
     n_workers : int or None
-        Workers to start; one a core where omitted.
+        Workers to start; one per core if omitted.
 
     Raises
     ------
@@ -102,11 +99,7 @@ def connected(scheduler: str | None, n_workers: int | None) -> Iterator[Client]:
 
 
 class _ClosingClient(Client):
-    """A client that is closed where it cannot start.
-
-    Left to the collector of garbage it would wait for a lock there, for ever where the collector
-    runs in a thread that holds it: in the start of another client.
-    """
+    """A client that is closed where it cannot connect: the garbage collector could deadlock."""
 
     def __init__(self, address: str, timeout: str) -> None:
         try:
@@ -118,6 +111,11 @@ class _ClosingClient(Client):
 
 def _start_workers(n_workers: int | None) -> LocalCluster:
     try:
+        # Without keys any user of this machine could run code on the workers.
+        security = Security.temporary()
+    except ImportError as error:
+        raise missing_extra("batches need cryptography", "batch") from error
+    try:
         return LocalCluster(
             n_workers=n_workers,
             threads_per_worker=1,
@@ -125,20 +123,10 @@ def _start_workers(n_workers: int | None) -> LocalCluster:
             scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
             silence_logs=logging.CRITICAL,
             preload="gvo.batch.worker",
-            # Without keys any user of this machine could run code on the workers.
-            security=_make_security(),
+            security=security,
         )
     except (OSError, RuntimeError) as error:
         raise ClusterError(f"workers cannot be started: {error.__cause__ or error}") from error
-
-
-def _make_security() -> Security:
-    """Return keys and a certificate for this batch alone."""
-    try:
-        security: Security = Security.temporary()
-    except ImportError as error:
-        raise missing_extra("batches need cryptography", "batch") from error
-    return security
 
 
 @contextmanager
@@ -156,16 +144,9 @@ def _silenced_client() -> Iterator[None]:
 class Engine:
     """Submits tasks to a cluster and yields their rows.
 
-    Dask runs a task whose worker dies on another worker, up to `allowed-failures` times. Tasks that
-    wait on the same worker are counted with it, so those given up run once more at the end, one by
-    one: who kills its worker then is to blame.
-
-    Parameters
-    ----------
-    client : Client
-    options : TaskOptions
-    on_progress : callable, optional
-        Called whenever a run has ended, and several times a second.
+    Dask runs a task whose worker dies on another worker, up to `allowed-failures` times. It blames
+    all tasks that waited on the same worker, so those given up run once more at the end, one by
+    one: the task that kills its worker then is to blame.
     """
 
     def __init__(
@@ -177,39 +158,26 @@ class Engine:
         self._client, self._options, self._on_progress = client, options, on_progress
         self._id = f"gvo-batch-{uuid.uuid4().hex[:12]}"
         self._done: SimpleQueue[Future[BatchRow]] = SimpleQueue()
-        self._running: dict[Any, tuple[int, Task, Future[BatchRow]]] = {}
-        self._frames: dict[int, tuple[int, int]] = {}
+        self._running: dict[Any, tuple[Task, Future[BatchRow]]] = {}
         self._state = BatchProgress()
         self._start_s = 0.0
-        self._n_frames = 0  # of the runs that are done
-        self._counted_s: float | None = None
-        self._n_threads = 0
 
     def run(self, tasks: Sequence[Task]) -> Generator[BatchRow, None, None]:
-        """Yield the row of each task as it ends.
-
-        Raises
-        ------
-        ClusterError
-            When the scheduler is lost.
-        """
-        self._state = BatchProgress(n_total=len(tasks))
-        self._start_s, self._n_frames = time.monotonic(), 0
-        self._client.subscribe_topic(self._id, self._on_frames)
+        """Yield the row of each task as it ends; raise `ClusterError` if the scheduler is lost."""
+        self._state, self._start_s = BatchProgress(n_total=len(tasks)), time.monotonic()
         suspects: list[Task] = []
         try:
             yield from self._run(deque(enumerate(tasks)), suspects)
             yield from self._run(deque(enumerate(suspects, start=len(tasks))), None)
         finally:
-            self._client.cancel([future for _, _, future in self._running.values()])
-            self._client.unsubscribe_topic(self._id)
+            self._client.cancel([future for _, future in self._running.values()])
 
     def _run(
         self, waiting: deque[tuple[int, Task]], suspects: list[Task] | None
     ) -> Iterator[BatchRow]:
         while waiting or self._running:
-            self._count_workers()
-            max_running = max(_MIN_IN_FLIGHT, _PER_THREAD * self._n_threads)
+            n_threads = self._count_workers()
+            max_running = max(_MIN_IN_FLIGHT, _PER_THREAD * n_threads)
             while waiting and len(self._running) < (1 if suspects is None else max_running):
                 self._submit(*waiting.popleft())
             row = self._next(suspects)
@@ -217,7 +185,7 @@ class Engine:
                 self._count(row)
                 yield row
             if self._on_progress is not None:
-                self._on_progress(self._progress(row))
+                self._on_progress(replace(self._state, left_s=self._left_s(), row=row))
 
     def _next(self, suspects: list[Task] | None) -> BatchRow | None:
         """Wait a moment for a task to end; return its row."""
@@ -225,28 +193,24 @@ class Engine:
             future = self._done.get(timeout=_TICK_S)
         except Empty:
             return None
-        number, task, _ = self._running.pop(future.key)
-        self._frames.pop(number, None)
+        task, _ = self._running.pop(future.key)
         return self._result(task, future, suspects)
 
-    def _count_workers(self) -> None:
-        now = time.monotonic()
-        if self._counted_s is not None and now - self._counted_s < _COUNT_EVERY_S:
-            return
-        self._counted_s = now
+    def _count_workers(self) -> int:
+        """Count the workers; return the number of their threads."""
         try:
             threads = self._client.nthreads()
         except OSError as error:
             raise ClusterError(_LOST) from error
-        self._n_threads = sum(threads.values())
         self._state = replace(self._state, n_workers=len(threads))
+        return sum(threads.values())
 
     def _submit(self, number: int, task: Task) -> None:
         # Tasks whose keys share a prefix are one group, which the scheduler queues until a worker
         # has a free thread.
         key = (self._id, number)
-        future = self._client.submit(work, task, self._options, self._id, key, key=key, pure=False)
-        self._running[key] = number, task, future
+        future = self._client.submit(work, task, self._options, key, key=key, pure=False)
+        self._running[key] = task, future
         future.add_done_callback(self._done.put)
 
     def _result(
@@ -260,7 +224,7 @@ class Engine:
             if suspects is not None:
                 suspects.append(task)
                 return None
-            return task.row("failed", f"its worker died, each time: killed for memory? ({error})")
+            return task.row("failed", f"its worker died each time: out of memory? ({error})")
         except Exception as error:  # noqa: BLE001 - one run must not end the batch
             text = cut(f"{type(error).__name__}: {error}".partition("\n")[0], _MAX_REASON)
             return task.row("failed", text)
@@ -269,7 +233,6 @@ class Engine:
 
     def _count(self, row: BatchRow) -> None:
         state = self._state
-        self._n_frames += 0 if row.is_found else row.frames or 0
         self._state = replace(
             state,
             n_done=state.n_done + 1,
@@ -277,17 +240,9 @@ class Engine:
             n_failed=state.n_failed + (row.status == "failed"),
         )
 
-    async def _on_frames(self, event: tuple[float, tuple[int, int, int]]) -> None:
-        number, n_done, n_total = event[1]
-        self._frames[number] = n_done, n_total
-
-    def _progress(self, row: BatchRow | None) -> BatchProgress:
-        running = [self._frames[n] for n, _, _ in self._running.values() if n in self._frames]
-        state, elapsed_s = self._state, max(time.monotonic() - self._start_s, 1e-9)
-        n_frames = self._n_frames + sum(n_done for n_done, _ in running)
-        shares = sum(min(n_done / max(n_total, 1), 1.0) for n_done, n_total in running)
-        # Runs found finished took no time.
-        worked = state.n_done - state.n_found + shares
-        n_left = state.n_total - state.n_done - shares
-        left_s = elapsed_s * n_left / worked if worked > 0 else None
-        return replace(state, frames_per_s=n_frames / elapsed_s, left_s=left_s, row=row)
+    def _left_s(self) -> float | None:
+        state = self._state
+        n_worked = state.n_done - state.n_found  # runs found finished took no time
+        if n_worked == 0:
+            return None
+        return (time.monotonic() - self._start_s) * (state.n_total - state.n_done) / n_worked

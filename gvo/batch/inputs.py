@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import glob
 import json
 import math
+import os
 import re
 from collections import Counter
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TypeVar
 
 from gvo._text import YamlError, cut, load_yaml, text_lines
-from gvo.batch.results import CSV, PARQUET
-from gvo.batch.storage import Place, is_url
+from gvo.batch.results import CSV
 from gvo.batch.tasks import MARK, Value
-from gvo.config import Config, RuntimeConfig, load_configuration
+from gvo.config import Config, RuntimeConfig, load_configuration, values_by_name
 from gvo.errors import ConfigurationError, RecordingError
 from gvo.io.opening import BAG_SUFFIXES, FOLDER_MARKERS
 from gvo.io.run_folder.writer import REPORT
@@ -31,7 +32,7 @@ _MAX_DEPTH = 12
 _COMPRESSED = ".zstd"
 _COMMENT = re.compile(r"(^|\s)#.*")
 # The batch's own files, also while they are written.
-_TAKEN = {f"{name}{end}" for name in (CSV, PARQUET, REPORT, MARK) for end in ("", ".new")}
+_TAKEN = {f"{name}{end}" for name in (CSV, REPORT, MARK) for end in ("", ".new")}
 DEFAULT = "default"
 _MAX_SHOWN = 100
 _MAX_LISTED = 1_000_000  # lines of a list of recordings
@@ -47,7 +48,7 @@ class NamedRecording:
     name : str
         Unique, and valid as the name of a folder.
     location : str
-        Absolute path, or URL.
+        Absolute path.
     """
 
     name: str
@@ -60,10 +61,10 @@ def find_recordings(asked: Sequence[str | Path]) -> list[NamedRecording]:
     Parameters
     ----------
     asked : sequence of str or Path
-        Each a recording, as a path or a URL that fsspec knows; a pattern (`*`, `?`, `[`, `**`);
-        a folder, which is searched unless it is a recording itself; or a `.txt` file with one of
-        these a line, relative to its folder, `#` before a comment (after a blank, within a line).
-        A path that does not exist is taken for a recording that only the workers see.
+        Each a path of a recording; a pattern (`*`, `?`, `[`, `**`); a folder, which is searched
+        unless it is a recording itself; or a `.txt` file with one of these per line, relative to
+        its folder, with comments after `#`. A path that does not exist is taken for a recording
+        that only the workers see.
 
     Raises
     ------
@@ -76,9 +77,9 @@ def find_recordings(asked: Sequence[str | Path]) -> list[NamedRecording]:
         raise ValueError("expected at least one recording")
     locations: dict[str, None] = {}
     for one in asked:
-        text = str(one)
-        is_list = not is_url(text) and text.endswith(_LIST_SUFFIX) and Path(text).is_file()
-        found = list(_read_list(Path(text)) if is_list else _search(text))
+        path = Path(one)
+        is_list = path.suffix == _LIST_SUFFIX and path.is_file()
+        found = list(_read_list(path) if is_list else _search(str(one)))
         if not found:
             raise RecordingError(f"{one}: no recording there")
         locations.update(dict.fromkeys(found))
@@ -90,7 +91,7 @@ def _read_list(path: Path) -> Iterator[str]:
         entry = _COMMENT.sub("", line).strip()
         if not entry:
             continue
-        found = list(_search(entry if is_url(entry) else str(path.parent / entry)))
+        found = list(_search(str(path.parent / entry)))
         if not found:
             raise RecordingError(f"{path}, line {number}: {entry}: no recording there")
         yield from found
@@ -98,32 +99,33 @@ def _read_list(path: Path) -> Iterator[str]:
 
 def _search(text: str) -> Iterator[str]:
     """Yield the recordings that a path, a pattern or a folder leads to."""
-    place = Place.of(text)
-    if not _PATTERN.search(place.path) or place.exists():
-        yield from (found.location for found in _search_below(place))
+    # Links are not resolved: on a worker they may lead elsewhere.
+    place = Path(os.path.abspath(Path(text).expanduser()))  # noqa: PTH100
+    if not _PATTERN.search(str(place)) or place.exists():
+        yield from map(str, _search_below(place))
         return
-    taken: set[str] = set()
-    for match in place.matches():
+    taken: set[Path] = set()
+    for match in map(Path, sorted(glob.glob(str(place), recursive=True))):  # noqa: PTH207
         # The files inside a recording that is a folder are not recordings.
-        is_inside = not taken.isdisjoint(map(str, PurePosixPath(match.path).parents))
-        if not is_inside and (match.is_folder() or _is_bag(match.name)):
+        is_inside = not taken.isdisjoint(match.parents)
+        if not is_inside and (match.is_dir() or _is_bag(match.name)):
             found = list(_search_below(match))
-            taken.update(one.path for one in found)
-            yield from (one.location for one in found)
+            taken.update(found)
+            yield from map(str, found)
 
 
-def _search_below(place: Place, depth: int = 0) -> Iterator[Place]:
+def _search_below(place: Path, depth: int = 0) -> Iterator[Path]:
     """Yield a place that is a recording, else the recordings in the folder."""
-    if not place.is_folder():
+    if not place.is_dir():
         yield place
         return
-    entries = place.entries()
+    entries = sorted(place.iterdir())
     if any(entry.name in FOLDER_MARKERS for entry in entries):
         yield place
         return
     for entry in entries:
         is_open = depth < _MAX_DEPTH and not entry.name.startswith(".")
-        if is_open and (_is_bag(entry.name) or entry.is_folder()):
+        if is_open and (_is_bag(entry.name) or entry.is_dir()):
             yield from _search_below(entry, depth + 1)
 
 
@@ -146,9 +148,7 @@ def _name(locations: Sequence[str]) -> list[NamedRecording]:
 
 def _ends(location: str) -> Iterator[str]:
     """Yield ends of a path, from short to long."""
-    # In a URL the archive that holds the path follows.
-    path = location.partition("::")[0] if is_url(location) else location
-    *parents, last = [part for part in PurePosixPath(path).parts if part != "/"] or ["root"]
+    *parents, last = Path(location).parts[1:] or ["root"]
     plain = last.removesuffix(_COMPRESSED)
     yield plain.rpartition(".")[0] if plain.endswith(BAG_SUFFIXES) else plain
     yield last
@@ -165,24 +165,12 @@ def _numbered(named: Iterable[tuple[str, T]], taken: Container[str] = ()) -> dic
 
 
 def safe_name(text: str) -> str:
-    """Return a text as a valid name of a folder.
-
-    Examples
-    --------
-    >>> safe_name("day 1/../drive")
-    'day_1_.._drive'
-    """
+    """Return a text as a valid name of a folder: `day 1/../drive` as `day_1_.._drive`."""
     return _UNSAFE.sub("_", text).lstrip(".")[:_MAX_NAME] or "_"
 
 
 def free_name(name: str, *taken: Container[str]) -> str:
-    """Return a name, numbered if it is taken.
-
-    Examples
-    --------
-    >>> free_name("drive", {"drive", "drive-2"})
-    'drive-3'
-    """
+    """Return a name, numbered if it is taken."""
     free, number = name, 2
     while any(free in names for names in taken):
         free, number = f"{name}-{number}", number + 1
@@ -207,12 +195,12 @@ class Variant:
 def make_variants(
     files: Sequence[Path] = (), settings: Sequence[str] = (), sweeps: Sequence[str] = ()
 ) -> list[Variant]:
-    """Return the product of configuration files and swept values.
+    """Return each configuration file with each combination of swept values.
 
     Parameters
     ----------
     files : sequence of Path
-        YAML files; the defaults without one.
+        YAML files; without one, the defaults.
     settings : sequence of str
         `section.key=value`, for all configurations.
     sweeps : sequence of str
@@ -268,20 +256,11 @@ def _variants(named: Iterable[tuple[str, Config]]) -> list[Variant]:
 
 def differences(configs: Sequence[Config]) -> list[dict[str, Value]]:
     """Return the values of each configuration that are not the same in all."""
-    flat = [flatten(config) for config in configs]
+    flat = [values_by_name(config) for config in configs]
     keys = [
         key for key in (flat[0] if flat else {}) if any(one[key] != flat[0][key] for one in flat)
     ]
     return [{key: one[key] for key in keys} for one in flat]
-
-
-def flatten(config: Config) -> dict[str, Value]:
-    """Return a configuration by `section.key`, lists and mappings as JSON texts."""
-    return {
-        f"{section}.{key}": json.dumps(value) if isinstance(value, list | dict) else value
-        for section, values in config.model_dump(mode="json").items()
-        for key, value in values.items()
-    }
 
 
 def _text_of(values: Mapping[str, Value]) -> str:
@@ -315,7 +294,7 @@ def _parse_sweep(sweep: str) -> list[Value]:
 
 
 def _on_one_thread(config: Config) -> Config:
-    """Do not read ahead on a second thread unless asked to: each core has a run."""
+    """Set one thread unless another number is asked for: each core has a run of its own."""
     if "runtime" in config.model_fields_set and "threads" in config.runtime.model_fields_set:
         return config
     runtime = RuntimeConfig.model_validate({**config.runtime.model_dump(), "threads": 1})

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,12 +16,11 @@ from gvo._version import __version__
 from gvo.batch.engine import BatchProgress, Engine, connected
 from gvo.batch.inputs import NamedRecording, Variant, differences, find_recordings, name_variants
 from gvo.batch.results import CSV, to_frame, write_results
-from gvo.batch.storage import Place, is_url, store
 from gvo.batch.tasks import MARK, BatchOptions, BatchRow, Task, TaskOptions
 from gvo.config import Config
 from gvo.errors import OutputError, write_faults
-from gvo.io.run_folder.line_file import check_new, replace_text
-from gvo.io.run_folder.writer import REPORT, check_unused
+from gvo.io.run_folder.line_file import replace_text
+from gvo.io.run_folder.writer import check_unused
 
 # How often the table is written while the batch runs.
 _EVERY_S = 10.0
@@ -45,18 +43,18 @@ def run(
 
     Parameters
     ----------
-    recordings : path or URL, or a sequence of them
+    recordings : path, or sequence of paths
         Recordings, patterns, folders, lists; see `find_recordings`.
     configs : Config, sequence, or mapping of names, optional
         The defaults if omitted, except `runtime.threads`, which is 1: each core has a run.
     out : str or Path
-        Folder that all workers see, or a URL.
+        Folder that all workers see under this path.
     client : distributed.Client, optional
-        Of a cluster; a worker of one thread for each core of this machine if omitted.
+        Client of a cluster; if omitted, one worker of one thread is started per core.
     options : BatchOptions, optional
     on_progress : callable, optional
-        Called in this thread, several times a second. What it raises ends the batch; finished runs
-        stay.
+        Called in this thread, several times a second. What it raises ends the batch; finished
+        runs stay.
 
     Returns
     -------
@@ -95,10 +93,10 @@ def run_batch(
     on_progress: Callable[[BatchProgress], None] | None = None,
 ) -> pd.DataFrame:
     """Run recordings with named configurations; see `run`."""
-    tasks = make_tasks(recordings, variants)
-    check_place(out, tasks, options)
-    table = _Table(out, tasks, options.plots)
-    shared = TaskOptions(out=table.location, mark=table.mark, batch=options)
+    tasks, folder = make_tasks(recordings, variants), Path(out).absolute()
+    check_place(folder, tasks, options)
+    table = _Table(folder, tasks)
+    shared = TaskOptions(out=folder, mark=table.mark, batch=options)
     with ExitStack() as stack:
         stack.enter_context(table.written())
         client = client or stack.enter_context(connected(None, None))
@@ -119,15 +117,13 @@ def check_place(out: str | Path, tasks: Sequence[Task], options: BatchOptions) -
     """
     if options.force:
         return
-    is_new = not Place.of(f"{out}/{MARK}").exists()
-    if is_new and options.plots is not None:
-        check_new(options.plots, otherwise="--force to replace its plots")
-    for folder in ("", *(task.folder for task in tasks)) if is_new and not is_url(out) else ():
-        check_unused(Path(out, folder))
+    if not Path(out, MARK).exists():
+        for folder in ("", *(task.folder for task in tasks)):
+            check_unused(Path(out, folder))
     with suppress(OSError, ValueError, KeyError):  # no table, or a damaged one
-        rows = pd.read_csv(f"{out}/{CSV}", dtype=str, keep_default_na=False)
+        rows = pd.read_csv(Path(out, CSV), dtype=str, keep_default_na=False)
         there = rows["folder"][rows["status"] != "failed"]
-        gone = there[~there.isin(to_frame([task.row("failed") for task in tasks])["folder"])]
+        gone = there[~there.isin([task.folder for task in tasks])]
         if len(gone):
             raise OutputError(
                 f"{out}: holds another batch, of which {gone.iloc[0]} would leave the table; give "
@@ -155,57 +151,40 @@ def make_tasks(recordings: Sequence[NamedRecording], variants: Sequence[Variant]
 class _Table:
     """The rows of a batch, and the files that show them."""
 
-    def __init__(self, out: str | Path, tasks: Sequence[Task], plots: Path | None) -> None:
-        self._plots = plots
+    def __init__(self, folder: Path, tasks: Sequence[Task]) -> None:
         self.mark = uuid.uuid4().hex
-        self._is_remote = is_url(out)
-        self.location = str(out).rstrip("/") if self._is_remote else str(Path(out).absolute())
+        self._folder = folder
         self._places = {task.folder: place for place, task in enumerate(tasks)}
         self._rows: list[BatchRow] = []
         self._written_s = time.monotonic()
 
     def add(self, row: BatchRow) -> None:
         self._rows.append(row)
-        if time.monotonic() - self._written_s > _EVERY_S and not self._is_remote:
-            write_results(self.frame(), Path(self.location))
+        if time.monotonic() - self._written_s > _EVERY_S:
+            write_results(self.frame(), self._folder)
             self._written_s = time.monotonic()
 
-    def rows(self) -> list[BatchRow]:
-        """Return the rows in the order of the tasks."""
-        return sorted(self._rows, key=lambda row: self._places[row.folder])
-
     def frame(self) -> pd.DataFrame:
-        return to_frame(self.rows())
+        """Return the rows so far, in the order of the tasks."""
+        return to_frame(sorted(self._rows, key=lambda row: self._places[row.folder]))
 
     @contextmanager
     def written(self) -> Iterator[None]:
         """Mark the folder; write table and report at the end, also after an exception."""
         content = {"mark": self.mark, "gvo_version": __version__, "n_runs": len(self._places)}
-        with self._folder() as folder, write_faults(OutputError, folder):
-            folder.mkdir(parents=True, exist_ok=True)
-            replace_text(folder / MARK, json.dumps(content) + "\n")
+        with write_faults(OutputError, self._folder):
+            self._folder.mkdir(parents=True, exist_ok=True)
+            replace_text(self._folder / MARK, json.dumps(content) + "\n")
         try:
             yield
         finally:
             if self._rows:
-                with self._folder() as folder:
-                    write_results(self.frame(), folder)
-                    self._draw(folder)
+                write_results(self.frame(), self._folder)
+                self._draw()
 
-    @contextmanager
-    def _folder(self) -> Iterator[Path]:
-        """Yield the folder; for a URL a temporary one, stored there afterwards."""
-        if not self._is_remote:
-            yield Path(self.location)
-            return
-        with tempfile.TemporaryDirectory(prefix="gvo-") as copies:
-            yield Path(copies)
-            store(Path(copies), self.location)
-
-    def _draw(self, folder: Path) -> None:
-        from gvo.batch.report.report import write_batch_report
+    def _draw(self) -> None:
+        from gvo.batch.report import write_batch_report
 
         n_missing = len(self._places) - len(self._rows)
         note = f"{n_missing} runs were not made: the batch was stopped" if n_missing else ""
-        page, title = folder / REPORT, Path(self.location).name
-        write_batch_report(page, self.rows(), title=title, note=note, plots=self._plots)
+        write_batch_report(self._folder, self.frame(), note=note)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import tempfile
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -13,7 +12,6 @@ from typing import Any, Literal, TypeAlias
 
 from gvo._text import read_text
 from gvo._version import __version__
-from gvo.batch.storage import fetch, fetch_file, is_url, store
 from gvo.config import Config
 from gvo.errors import ConfigurationError, GvoError, OutputError, RunBusyError
 from gvo.io.excerpt import Excerpt
@@ -30,7 +28,7 @@ from gvo.types import Progress
 # A value of a parameter, as YAML gives it.
 Value: TypeAlias = float | int | bool | str | None
 RunStatus: TypeAlias = Literal["complete", "partly", "failed"]
-STAGES = ("extract", "register", "links", "window")
+_STAGES = ("extract", "register", "links", "window")
 MARK = "batch.json"
 # How long to wait for another process that writes the folder of the run.
 _BUSY_S = 30.0
@@ -54,7 +52,7 @@ class BatchRow:
     reason : str
         Why the run is not complete.
     source : str
-        Path or URL of the recording.
+        Path of the recording.
     folder : str
         Run folder, relative to the batch's.
     parameters : dict of str to value
@@ -111,7 +109,7 @@ class BatchRow:
     run_hash: str = ""
 
 
-def measures_of(summary: Mapping[str, Any]) -> dict[str, Any]:
+def _measures_of(summary: Mapping[str, Any]) -> dict[str, Any]:
     """Return the measures of a row from the `summary.json` of its run."""
     errors = {each["name"]: each for each in summary["errors"]}
     smoothed = errors.get("smoothed", {})
@@ -127,7 +125,7 @@ def measures_of(summary: Mapping[str, Any]) -> dict[str, Any]:
         "rpe_smoothed_deg": smoothed.get("rpe_deg"),
         "t_smoothed_percent": smoothed.get("t_pct"),
         "r_smoothed_deg_per_100m": smoothed.get("r_deg_per_100m"),
-        "frame_ms": sum(medians[stage] for stage in STAGES),
+        "frame_ms": sum(medians[stage] for stage in _STAGES),
         "gvo_version": summary["gvo_version"],
     }
 
@@ -143,37 +141,22 @@ class BatchOptions:
     excerpt : Excerpt, optional
         Which frames are read; all if omitted.
     report : bool
-        Draw the picture and the page of each run; those of the batch are always drawn.
+        Draw the picture and the report of each run; the batch's own report is always drawn.
     force : bool
-        Run what an earlier batch has finished again, and replace other results.
-    plots : Path, optional
-        Folder for each plot of the batch's report as PNG and PDF; one that holds something is
-        refused, unless `force` is set or the batch is one that goes on.
+        Also run what an earlier batch has finished, and replace other results.
     """
 
     recording: RecordingOptions = field(default_factory=RecordingOptions)
     excerpt: Excerpt | None = None
     report: bool = True
     force: bool = False
-    plots: Path | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TaskOptions:
-    """What all tasks of a batch have in common.
+    """What all tasks of a batch have in common: a token in `batch.json` tells the shared disk."""
 
-    Parameters
-    ----------
-    out : str
-        Folder of the batch, as an absolute path or a URL.
-    mark : str
-        Token in its `batch.json`: a worker that does not read it there has another disk.
-    batch : BatchOptions
-    gvo_version : str
-        Of the client; a worker with another version refuses the task.
-    """
-
-    out: str
+    out: Path
     mark: str
     batch: BatchOptions = field(default_factory=BatchOptions)
     gvo_version: str = __version__
@@ -181,20 +164,7 @@ class TaskOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Task:
-    """A recording and a configuration.
-
-    Parameters
-    ----------
-    recording, variant : str
-        Names of the recording and of the configuration.
-    source : str
-        Absolute path or URL of the recording.
-    folder : str
-        Run folder, relative to the batch's.
-    config : Config
-    parameters : dict of str to value
-        Those in which the configurations of the batch differ.
-    """
+    """A recording and a configuration; the run's folder is relative to the batch's."""
 
     recording: str
     variant: str
@@ -214,98 +184,72 @@ class Task:
             folder=self.folder,
             parameters=self.parameters,
             gvo_version=__version__,
-            configuration_hash=digest(self.config.model_dump(mode="json")),
+            configuration_hash=_digest(self.config.model_dump(mode="json")),
         )
 
 
 def run_task(
-    task: Task,
-    options: TaskOptions,
-    *,
-    scratch: Path | None = None,
-    on_progress: Callable[[Progress], None] | None = None,
+    task: Task, options: TaskOptions, *, on_progress: Callable[[Progress], None] | None = None
 ) -> BatchRow:
-    """Run a recording, unless its folder holds the finished run; replace any other there.
-
-    Parameters
-    ----------
-    task : Task
-    options : TaskOptions
-    scratch : Path, optional
-        Folder for copies from and to URLs; the system's temporary folder if omitted.
-    on_progress : callable, optional
-        Called after each frame.
-
-    Returns
-    -------
-    BatchRow
-        Failed, with its reason, wherever a `GvoError` was raised.
-    """
+    """Run a recording unless its folder holds the finished run; replace any other run there."""
     start = time.perf_counter()
     try:
-        if options.gvo_version != __version__:
-            raise ConfigurationError(
-                f"the worker has gvo {__version__}, the client {options.gvo_version}: install one"
-            )
-        with tempfile.TemporaryDirectory(prefix="gvo-", dir=scratch) as copies:
-            result, is_found = _run(task, options, Path(copies), on_progress)
+        _check_worker(options)
+        source = open_recording(
+            Path(task.source), config=task.config, options=options.batch.recording
+        )
+        result, is_found = _when_free(lambda: _find_or_run(source, task, options, on_progress))
     except GvoError as error:
         return task.row("failed", str(error))
     status: RunStatus = "complete" if result.is_complete else "partly"
     return replace(
         task.row(status, "" if status == "complete" else "; ".join(result.warnings)),
-        **measures_of(result.summary),
+        **_measures_of(result.summary),
         run_s=None if is_found else time.perf_counter() - start,
         is_found=is_found,
-        run_hash=digest([result.summary["run"], result.summary["configuration"]]),
+        run_hash=_digest([result.summary["run"], result.summary["configuration"]]),
     )
 
 
-def digest(values: object) -> str:
-    """Return a digest of values that JSON can hold."""
+def _digest(values: object) -> str:
     text = json.dumps(values, sort_keys=True, default=str)
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
-def _run(
-    task: Task, options: TaskOptions, copies: Path, on_progress: Callable[[Progress], None] | None
-) -> tuple[RunResult, bool]:
-    """Return the run, and whether it was found finished."""
-    path = fetch(task.source, copies) if is_url(task.source) else Path(task.source)
-    source = open_recording(path, config=task.config, options=options.batch.recording)
-
-    if not is_url(options.out):
-        out = Path(options.out)
-        _check_same_disk(out, options.mark)
-        return _when_free(
-            lambda: _find_or_run(out / task.folder, source, task, options, on_progress)
+def _check_worker(options: TaskOptions) -> None:
+    """Refuse a worker of another version, or one that does not see the folder of the batch."""
+    if options.gvo_version != __version__:
+        raise ConfigurationError(
+            f"the worker has gvo {__version__}, the client {options.gvo_version}: install one"
         )
-    folder, url = copies / "run", f"{options.out.rstrip('/')}/{task.folder}"
-    folder.mkdir()
-    fetch_file(f"{url}/{SUMMARY}", folder / SUMMARY)
-    result, is_found = _find_or_run(folder, source, task, options, on_progress)
-    if not is_found:
-        store(folder, url)
-    return result, is_found
+    try:
+        mark = json.loads((options.out / MARK).read_text(encoding="utf-8"))["mark"]
+    except (OSError, ValueError, KeyError, TypeError):
+        mark = None
+    if mark != options.mark:
+        raise OutputError(
+            f"{options.out}: the worker does not see the client's folder there; give --out on a "
+            "disk that both share, and run one batch at a time in it"
+        )
 
 
 def _find_or_run(
-    folder: Path,
     source: Source,
     task: Task,
     options: TaskOptions,
     on_progress: Callable[[Progress], None] | None,
 ) -> tuple[RunResult, bool]:
+    """Return the run, and whether it was found finished."""
+    folder = options.out / task.folder
     found = None if options.batch.force else _find_finished(folder, source, task, options)
     if found is not None:
         return found, True
-    outputs = RunOutputs(report=options.batch.report)
     result = run_recording(
         source,
         folder,
         config=task.config,
         excerpt=options.batch.excerpt,
-        outputs=outputs,
+        outputs=RunOutputs(report=options.batch.report),
         force=True,
         on_progress=on_progress,
     )
@@ -347,15 +291,3 @@ def _when_free(run: Callable[[], tuple[RunResult, bool]]) -> tuple[RunResult, bo
             if time.monotonic() > end_s:
                 raise
             time.sleep(_BUSY_TICK_S)
-
-
-def _check_same_disk(out: Path, mark: str) -> None:
-    try:
-        is_there = json.loads((out / MARK).read_text(encoding="utf-8"))["mark"] == mark
-    except (OSError, ValueError, KeyError, TypeError):
-        is_there = False
-    if not is_there:
-        raise OutputError(
-            f"{out}: the worker does not see the client's folder there; give --out on a disk that "
-            "both share, or a URL; and run one batch at a time in it"
-        )

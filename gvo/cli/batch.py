@@ -26,9 +26,9 @@ _MAX_WARNINGS = 20
 def batch(
     recordings: Annotated[
         list[str],
-        Argument(metavar="RECORDING...", help="Paths, URLs, patterns, folders, lists (.txt)."),
+        Argument(metavar="RECORDING...", help="Paths, patterns, folders, lists (.txt)."),
     ],
-    out: Annotated[str, Option(metavar="DIR", help="Folder to write, or a URL.")],
+    out: Annotated[Path, Option(metavar="DIR", help="Folder to write.")],
     *,
     sweep: Annotated[
         list[str] | None,
@@ -53,9 +53,6 @@ def batch(
     with_report: Annotated[
         bool, Option("--report/--no-report", help="Draw the picture and page of each run.")
     ] = True,
-    plots: Annotated[
-        Path | None, Option(metavar="DIR", help="Write the plots as PNG and PDF too.")
-    ] = None,
     options: opt.Options,
 ) -> None:
     """Run many recordings or configurations: one table, one report."""
@@ -75,7 +72,6 @@ def batch(
         excerpt=excerpt,
         report=with_report,
         force=force,
-        plots=plots,
     )
     check_place(out, make_tasks(found, variants), batch_options)
     counts = _count(len(found), "recording"), _count(len(variants), "configuration")
@@ -129,8 +125,8 @@ def _print_row(progress: BatchProgress) -> None:
 def _words(progress: BatchProgress) -> str:
     left = "" if progress.left_s is None else f", {_clock(progress.left_s)} left"
     return (
-        f"{progress.n_done} of {progress.n_total} runs, {progress.n_failed} failed, "
-        f"{progress.frames_per_s:.0f} frames/s on {progress.n_workers} workers{left}"
+        f"{progress.n_done} of {progress.n_total} runs, {progress.n_failed} failed, on "
+        f"{progress.n_workers} workers{left}"
     )
 
 
@@ -142,7 +138,7 @@ def _clock(seconds: float) -> str:
     return time.strftime("%H:%M:%S" if seconds >= 3600 else "%M:%S", time.gmtime(seconds))
 
 
-def _report(counts: Mapping[str, int], reasons: list[str], out: str) -> NoReturn:
+def _report(counts: Mapping[str, int], reasons: list[str], out: Path) -> NoReturn:
     """Print the outcome of a batch, and end with its exit code."""
     from gvo.io.run_folder.writer import REPORT
 
@@ -151,7 +147,7 @@ def _report(counts: Mapping[str, int], reasons: list[str], out: str) -> NoReturn
         warn([f"{len(reasons) - _MAX_WARNINGS} more runs are not complete, see the table"])
     words = ", ".join(f"{n} {status}" for status, n in counts.items())
     n_runs = sum(counts.values())
-    say(f"{_count(n_runs, 'run')}: {words}; {out.rstrip('/')}/{REPORT}")
+    say(f"{_count(n_runs, 'run')}: {words}; {out / REPORT}")
     if counts.get("failed") == n_runs:
         raise ConfigurationError("all runs failed")
     raise typer.Exit(exit_code(not reasons))

@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import Any
 
 import pytest
 from distributed import Client, LocalCluster
@@ -216,17 +215,6 @@ def near() -> Iterator[Client]:
         Client(threads) as client,
     ):
         yield client
-
-
-@pytest.fixture
-def memory() -> Iterator[str]:
-    import fsspec
-
-    files: Any = fsspec.filesystem("memory")
-    files.store.clear()
-    files.pseudo_dirs[:] = [""]
-    yield "memory://place"
-    files.store.clear()
 
 
 def copy_of(bag: Path, folder: Path, name: str) -> Path:

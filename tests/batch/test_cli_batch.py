@@ -88,22 +88,13 @@ def test_configurations_and_sweeps_are_all_pairs(
     # As the shell leaves a pattern in quotes, and as it expands one without.
     files = ["*.yaml"] if is_one_option else ["a.yaml", "b.yaml"]
     bag, sweep = bags / "walk0.mcap", "window.n_links=1,2"
-    answer = batch(bag, "--out", "out", "--configs", *files, "--sweep", sweep, "--plots", "plots")
+    answer = batch(bag, "--out", "out", "--configs", *files, "--sweep", sweep)
     assert answer.code == 0, answer.err
-    table = pd.read_parquet(tmp_path / "out" / "results.parquet")
+    table = pd.read_csv(tmp_path / "out" / "results.csv")
     values = list(zip(table["window.size"], table["window.n_links"], strict=True))
     assert values == [(3, 1), (3, 2), (4, 1), (4, 2)]
     assert table["variant"][0] == "a,window.n_links=1"
     assert is_complete(tmp_path / "out" / "walk0" / "b,window.n_links=2")
-    plots = {path.stem[3:]: path for path in (tmp_path / "plots").glob("*.png")}
-    assert {"boxes", "error_by_value", "front"} <= set(plots)
-    assert all(path.read_bytes().startswith(b"\x89PNG") for path in plots.values())
-    # The same batch may go on; another one does not replace its plots.
-    answer = batch(bag, "--out", "out", "--configs", *files, "--sweep", sweep, "--plots", "plots")
-    assert answer.code == 0, answer.err
-    refused = batch(bag, "--out", "other", "--plots", "plots")
-    words = "plots: exists already; give another path or --force to replace its plots"
-    assert (refused.code, refused.out, refused.err) == (2, "", f"gvo: error: {words}\n")
 
 
 @pytest.mark.parametrize("folder", ["", "walk0"])
@@ -120,12 +111,11 @@ def test_a_folder_that_holds_a_run_is_refused(
     assert batch(bags / "walk0.mcap", *words).code == 0
 
 
-@pytest.mark.parametrize("is_remote", [False, True])
 def test_a_batch_does_not_take_runs_out_of_a_table(
-    batch: Batch, bags: Path, tmp_path: Path, memory: str, is_remote: bool
+    batch: Batch, bags: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "broken.bag").write_text("no bag")
-    out: str | Path = memory if is_remote else tmp_path / "out"
+    out = tmp_path / "out"
     words = ["--out", out, "--duration", "0.2"]
     assert batch(*(bags / f"walk{n}.mcap" for n in (0, 1)), tmp_path / "broken.bag", *words).code
     said = refused(batch(bags / "walk1.mcap", bags / "walk2.mcap", *words))
@@ -158,7 +148,6 @@ def test_settings_and_excerpts_reach_the_runs(batch: Batch, bags: Path, tmp_path
         (["--configs", "none*.yaml"], "none*.yaml: no such configuration"),
         (["--every", "0"], "every"),
         (["--workers", "2", "--scheduler", "tcp://127.0.0.1:1"], "--scheduler names a cluster"),
-        (["nope://x/a.bag"], "Protocol not known"),
         (["*.nothing"], "no recording there"),
     ],
 )
@@ -213,13 +202,7 @@ def test_a_folder_that_cannot_be_written_is_told(batch: Batch, bags: Path, tmp_p
     refused(batch(bags, "--out", tmp_path / "file"))
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "fsspec",
-        *(pytest.param(n, marks=pytest.mark.acceptance) for n in ("pyarrow", "cryptography")),
-    ],
-)
+@pytest.mark.parametrize("name", ["dask", "cryptography"])
 def test_without_a_package_it_says_how_to_get_it(bags: Path, tmp_path: Path, name: str) -> None:
     program = f"import sys; sys.modules[{name!r}] = None\n{GVO[-1]}"
     out = tmp_path / "out"
@@ -333,11 +316,11 @@ def test_the_line_on_a_terminal_says_how_long_it_takes() -> None:
         "n_failed": 1,
         "n_workers": 4,
     }
-    progress = BatchProgress(**values, frames_per_s=99.6, left_s=75.0)
-    expected = "3 of 9 runs, 1 failed, 100 frames/s on 4 workers, 01:15 left"
+    progress = BatchProgress(**values, left_s=75.0)
+    expected = "3 of 9 runs, 1 failed, on 4 workers, 01:15 left"
     assert _words(progress) == expected
-    early = BatchProgress(**values, frames_per_s=0.0, left_s=None)
-    assert _words(early) == "3 of 9 runs, 1 failed, 0 frames/s on 4 workers"
+    early = BatchProgress(**values, left_s=None)
+    assert _words(early) == "3 of 9 runs, 1 failed, on 4 workers"
     assert _clock(3661) == "01:01:01"
 
 

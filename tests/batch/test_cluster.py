@@ -10,11 +10,9 @@ import pytest
 from distributed import Client
 
 import gvo
-from gvo.batch import BatchProgress, ClusterError, run
+from gvo.batch import BatchProgress, run
 from tests.batch.conftest import NO_REPORT, Cluster, is_complete, is_under_way, state_of, wait_until
 from tests.conftest import GVO, Command, assert_same_files
-
-NOWHERE = "tcp://127.0.0.1:1"
 
 
 def batch(*arguments: object) -> subprocess.Popen[str]:
@@ -156,7 +154,7 @@ def test_a_worker_with_another_disk_or_version_says_so(
         with Client(cluster.address) as client:
             table = run(bags, out="/proc/self/cwd/out", client=client, options=NO_REPORT)
             assert set(table["status"]) == {"failed"}
-            assert all("a disk that both share, or a URL" in reason for reason in table["reason"])
+            assert all("a disk that both share" in reason for reason in table["reason"])
             assert list(there.iterdir()) == []
             cluster.kill_worker(other_disk)
             cluster.add_worker("--preload", str(tmp_path / "older.py"))
@@ -165,19 +163,3 @@ def test_a_worker_with_another_disk_or_version_says_so(
         cluster.close()
     expected = f"the worker has gvo 0, the client {gvo.__version__}: install one"
     assert table["reason"].tolist() == [expected] * 3
-
-
-@pytest.mark.acceptance
-def test_a_lost_scheduler_is_an_error_of_its_own(tmp_path: Path, blocked: Path) -> None:
-    (tmp_path / "cluster").mkdir()
-    cluster = Cluster(tmp_path / "cluster")
-    try:
-        with Client(cluster.address) as client:
-
-            def kill(progress: BatchProgress) -> None:
-                cluster.scheduler.kill()
-
-            with pytest.raises(ClusterError, match="the scheduler is gone"):
-                run(blocked, out=tmp_path / "out", client=client, on_progress=kill)
-    finally:
-        cluster.close()

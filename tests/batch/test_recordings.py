@@ -1,22 +1,17 @@
 """Every recording that is asked for is found once, under a name of its own."""
 
-import os
 import re
-import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 
-import fsspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gvo.batch.inputs import NamedRecording, find_recordings, safe_name
-from gvo.batch.inputs import _name as name_all
-from gvo.batch.storage import fetch
+from gvo.batch import NamedRecording, find_recordings
 from gvo.errors import RecordingError
 
-OWN_FILES = {"batch.json", "report.html", "results.csv", "results.parquet"}
+OWN_FILES = ("batch.json", "report.html", "results.csv")
 
 
 def make_files(folder: Path, *names: str) -> None:
@@ -86,7 +81,7 @@ def test_a_name_that_looks_like_a_pattern_is_that_file(tmp_path: Path) -> None:
         assert locations(find_recordings([tmp_path / name])) == [str(tmp_path / name)]
 
 
-@pytest.mark.parametrize("name", ["a::b.bag", "a b.bag", "a#b.bag", "ä.bag", "a%20b.bag", "-x.bag"])
+@pytest.mark.parametrize("name", ["a b.bag", "a#b.bag", "ä.bag", "a%20b.bag", "-x.bag"])
 def test_strange_names_of_files_are_paths(tmp_path: Path, name: str) -> None:
     make_files(tmp_path, name)
     for asked in (tmp_path / name, tmp_path, f"{tmp_path}/*.bag"):
@@ -103,12 +98,12 @@ def test_a_list_has_one_recording_a_line(tmp_path: Path) -> None:
     make_files(tmp_path, "in/a.bag", "in/b#1.bag", "more/c.bag", "more/d.mcap")
     (tmp_path / "in" / "list.txt").write_bytes(
         b"\xef\xbb\xbf# recordings\r\na.bag\r\n\r\n  b#1.bag   # a comment\n../more\n"
-        b"../more/*.mcap\n/not/here.bag\nfile:///not/there.bag"
+        b"../more/*.mcap\n/not/here.bag"
     )
     found = locations(find_recordings([tmp_path / "in" / "list.txt"]))
     places = ["in/a.bag", "in/b#1.bag", "more/c.bag", "more/d.mcap"]
     expected = [str(tmp_path / place) for place in places]
-    assert found == [*expected, "/not/here.bag", "file:///not/there.bag"]
+    assert found == [*expected, "/not/here.bag"]
 
 
 def test_a_line_that_leads_nowhere_is_named(tmp_path: Path) -> None:
@@ -138,45 +133,8 @@ def test_nothing_asked_for_is_misuse() -> None:
         find_recordings([])
 
 
-@pytest.mark.parametrize(
-    ("url", "said"),
-    [
-        ("nope://x/a.bag", "Protocol not known"),
-        ("nope://x/*.bag", "Protocol not known"),
-        ("memory://place/*.bag", "no recording there"),
-    ],
-)
-def test_a_url_that_leads_nowhere_is_named(memory: str, url: str, said: str) -> None:
-    with pytest.raises(RecordingError, match=f"^{re.escape(url)}: .*{said}"):
-        find_recordings([url])
-
-
-def test_urls_are_searched_like_folders(memory: str) -> None:
-    files = fsspec.filesystem("memory")
-    for name in ("a.bag", "deep/b.mcap", "drive/metadata.yaml", "drive/drive_0.db3", "notes.md"):
-        files.pipe(f"/place/{name}", b"")
-    expected = [f"{memory}/{name}" for name in ("a.bag", "deep/b.mcap", "drive")]
-    assert locations(find_recordings([memory])) == expected
-    assert locations(find_recordings([f"{memory}/"])) == expected
-    assert locations(find_recordings([f"{memory}/*.bag"])) == expected[:1]
-    assert locations(find_recordings([f"{memory}/a.bag", memory])) == expected
-    assert sorted(locations(find_recordings([f"{memory}/**"]))) == expected
-
-
-def test_what_is_found_in_an_archive_is_fetched_from_there(tmp_path: Path) -> None:
-    archive = tmp_path / "a.zip"
-    with zipfile.ZipFile(archive, "w") as file:
-        file.writestr("in/one.bag", b"1")
-        file.writestr("in/two.bag", b"2")
-    for asked in (f"zip://in::file://{archive}", f"zip://in/*.bag::file://{archive}"):
-        found = find_recordings([asked])
-        assert names(found) == ["one", "two"]
-        contents = [fetch(one.location, tmp_path).read_bytes() for one in found]
-        assert contents == [b"1", b"2"]
-
-
 def test_a_name_is_the_stem_where_that_is_enough() -> None:
-    asked = ["/x/a.bag", "/y/b.mcap.zstd", "/z/c", "file:///u/d.db3", "/v/2011.09.26"]
+    asked = ["/x/a.bag", "/y/b.mcap.zstd", "/z/c", "/u/d.db3", "/v/2011.09.26"]
     assert names(find_recordings(asked)) == ["a", "b", "c", "d", "2011.09.26"]
 
 
@@ -186,26 +144,18 @@ def test_what_has_one_stem_is_told_apart_by_its_ending_or_its_folders() -> None:
     assert names(find_recordings(asked)) == expected
 
 
-@pytest.mark.parametrize("name", sorted(OWN_FILES))
+@pytest.mark.parametrize("name", OWN_FILES)
 def test_no_run_folder_stands_where_the_batch_writes(name: str) -> None:
     found = names(find_recordings([f"/x/{name}", f"/x/{name}.new", f"/y/{name}.bag"]))
     assert len(set(found)) == 3
     assert not set(found) & {name, f"{name}.new"}
 
 
-@given(st.lists(st.text(min_size=1), min_size=1, unique=True))
+@given(st.lists(st.text("aé /.*~=-\n", min_size=1), min_size=1, unique=True))
 def test_every_name_is_unlike_all_others_and_fit_for_a_folder(texts: list[str]) -> None:
-    given_names = name_all([f"/{text}" for text in texts])
-    assert [each.location for each in given_names] == [f"/{text}" for text in texts]
-    made = [each.name for each in given_names]
+    found = find_recordings([f"/nowhere/{text.replace('*', '')}x.bag" for text in texts])
+    made = names(found)
     assert len(set(made)) == len(made)
     for name in made:
         assert re.fullmatch(r"[A-Za-z0-9_=,+-][A-Za-z0-9._=,+-]*", name)
-        assert len(os.fsencode(name)) <= 200
-
-
-@given(st.text())
-def test_a_safe_name_is_itself_safe(text: str) -> None:
-    name = safe_name(text)
-    assert name not in ("", ".", "..")
-    assert safe_name(name) == name
+        assert len(name) <= 200

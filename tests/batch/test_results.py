@@ -1,16 +1,13 @@
-"""The table holds what the rows hold, and both files give it back."""
+"""The table holds what the rows hold, and the file gives it back."""
 
-import math
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 
 import pandas as pd
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from gvo.batch.results import CSV, PARQUET, to_frame, write_results
-from gvo.batch.tasks import BatchRow, Value
+from gvo.batch.results import CSV, to_frame, write_results
+from gvo.batch.tasks import Value
 from gvo.errors import OutputError
 from tests.batch.rows import complete, failed
 
@@ -33,22 +30,21 @@ def read_csv(path: Path, frame: pd.DataFrame) -> pd.DataFrame:
     return pd.read_csv(path, dtype=kinds, keep_default_na=False, na_values=[""])
 
 
-def assert_both_give_it_back(frame: pd.DataFrame, folder: Path) -> None:
+def assert_the_file_gives_it_back(frame: pd.DataFrame, folder: Path) -> None:
     write_results(frame, folder)
-    pd.testing.assert_frame_equal(pd.read_parquet(folder / PARQUET), frame)
     # A table of text cannot tell an empty text from none.
     texts = list(frame.select_dtypes(["object", "string"]).columns)
     read = read_csv(folder / CSV, frame)
     filled = dict.fromkeys(texts, "")
     pd.testing.assert_frame_equal(read.fillna(filled), frame.fillna(filled), check_dtype=False)
-    assert {path.name for path in folder.iterdir()} == {CSV, PARQUET}
+    assert {path.name for path in folder.iterdir()} == {CSV}
 
 
-def test_both_files_give_the_table_back(tmp_path: Path) -> None:
+def test_the_file_gives_the_table_back(tmp_path: Path) -> None:
     frame = to_frame(
         [complete(**MEASURED), failed(), complete(**MEASURED | {"is_found": True, "run_s": None})]
     )
-    assert_both_give_it_back(frame, tmp_path)
+    assert_the_file_gives_it_back(frame, tmp_path)
     assert pd.read_csv(tmp_path / CSV)["ate_smoothed_m"].tolist()[0] == 0.1 + 0.2
 
 
@@ -63,78 +59,51 @@ def test_every_field_of_a_row_has_its_column() -> None:
         assert pd.isna(found) if value is None else found == value, name
 
 
-def test_no_field_of_a_row_is_of_a_kind_unknown_to_the_table() -> None:
-    kinds = {"Int64", "float64", "bool"}
-    texts = {each.name for each in fields(BatchRow) if "str" in str(each.type)}
-    texts |= {"status"}
-    frame = to_frame([complete(), failed()])
-    for name, kind in frame.dtypes.items():
-        assert (str(kind) in kinds) == (name not in texts), name
-
-
 def test_a_table_of_failures_alone_has_the_same_columns(tmp_path: Path) -> None:
     frame = to_frame([failed(), failed(recording="c")])
     assert list(frame.columns) == list(to_frame([complete()]).columns)
     numbers = frame.drop(columns=["is_found"]).select_dtypes("number")
     assert numbers.isna().all().all()
     assert (numbers.dtypes == to_frame([complete()])[numbers.columns].dtypes).all()
-    assert_both_give_it_back(frame, tmp_path)
+    assert_the_file_gives_it_back(frame, tmp_path)
 
 
 @pytest.mark.parametrize("name", HOSTILE)
 def test_names_and_reasons_are_given_back_whatever_they_hold(tmp_path: Path, name: str) -> None:
     frame = to_frame([failed(recording=name, reason=name, source=name), complete()])
     assert frame["reason"].iloc[0] == name
-    assert_both_give_it_back(frame, tmp_path)
+    assert_the_file_gives_it_back(frame, tmp_path)
 
 
 def test_what_is_no_character_in_the_name_of_a_file_is_escaped(tmp_path: Path) -> None:
     source = b"/x/\xff.bag".decode(errors="surrogateescape")
     frame = to_frame([failed(source=source, reason=f"{source}: no", parameters={"a.b": source})])
-    assert frame["source"].iloc[0] == r"/x/\udcff.bag"
-    assert_both_give_it_back(frame, tmp_path)
+    write_results(frame, tmp_path)
+    assert pd.read_csv(tmp_path / CSV)["source"][0] == r"/x/\udcff.bag"
 
 
 @pytest.mark.parametrize(
-    ("values", "kind", "expected"),
+    ("values", "kind"),
     [
-        ([1, 2, None], "Int64", [1, 2, None]),
-        ([1, 2.5, None], "float64", [1.0, 2.5, None]),
-        ([True, False, None], "boolean", [True, False, None]),
-        (["klt", "a,b", None], "string", ["klt", "a,b", None]),
-        ([1, "klt", None], "string", ["1", '"klt"', "null"]),
-        ([True, 1], "string", ["true", "1"]),
-        ([10**30, 1], "string", [str(10**30), "1"]),
-        ([2**63 - 1, -(2**63) + 1], "Int64", [2**63 - 1, -(2**63) + 1]),
-        ([1e-7, 10**30], "float64", [1e-7, 1e30]),
-        ([None, None], "string", ["null", "null"]),
+        ([1, 2, None], "Int64"),
+        ([1.5, 2.5, None], "Float64"),
+        ([True, False, None], "boolean"),
+        (["klt", "a,b", None], "string"),
+        ([1, "klt", None], "object"),
+        ([None, None], "object"),
     ],
 )
-def test_the_values_of_a_parameter_are_one_kind(
-    tmp_path: Path, values: list[Value], kind: str, expected: list[Value]
+def test_the_values_of_a_parameter_are_given_back(
+    tmp_path: Path, values: list[Value], kind: str
 ) -> None:
     frame = to_frame([complete(parameters={"x.y": value}) for value in values])
     assert str(frame["x.y"].dtype) == kind
-    found = [None if pd.isna(value) else value for value in frame["x.y"]]
-    assert found == expected
-    assert_both_give_it_back(frame, tmp_path)
-
-
-@settings(max_examples=30)
-@given(
-    values=st.lists(
-        st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
-        min_size=1,
-        max_size=5,
-    )
-)
-def test_any_values_of_a_parameter_can_be_written(
-    tmp_path_factory: pytest.TempPathFactory, values: list[Value]
-) -> None:
-    folder = tmp_path_factory.mktemp("table")
-    frame = to_frame([complete(parameters={"x.y": value}) for value in values])
-    write_results(frame, folder)
-    pd.testing.assert_frame_equal(pd.read_parquet(folder / PARQUET), frame)
+    assert [None if pd.isna(value) else value for value in frame["x.y"]] == values
+    write_results(frame, tmp_path)
+    read = pd.read_csv(tmp_path / CSV, dtype=str)["x.y"]
+    assert [None if pd.isna(text) else text for text in read] == [
+        None if value is None else str(value) for value in values
+    ]
 
 
 def test_parameters_stand_beside_the_status_and_may_be_missing() -> None:
@@ -142,7 +111,7 @@ def test_parameters_stand_beside_the_status_and_may_be_missing() -> None:
     assert list(frame.columns)[:6] == ["recording", "variant", "status", "reason", "a.b", "c.d"]
     assert frame["a.b"].tolist()[0] == 1
     assert pd.isna(frame["a.b"].iloc[1])
-    assert math.isnan(frame["c.d"].iloc[0])
+    assert pd.isna(frame["c.d"].iloc[0])
 
 
 def test_a_table_without_rows_has_its_columns(tmp_path: Path) -> None:
@@ -153,10 +122,8 @@ def test_a_table_without_rows_has_its_columns(tmp_path: Path) -> None:
 
 def test_what_cannot_be_written_leaves_what_was_there(tmp_path: Path) -> None:
     write_results(to_frame([complete()]), tmp_path)
-    before = (tmp_path / PARQUET).read_bytes()
     (tmp_path / CSV).unlink()
     (tmp_path / CSV).mkdir()
     with pytest.raises(OutputError, match=r"results\.csv: cannot be written"):
         write_results(to_frame([failed()]), tmp_path)
-    assert (tmp_path / PARQUET).read_bytes() == before
-    assert {path.name for path in tmp_path.iterdir()} == {CSV, PARQUET}
+    assert {path.name for path in tmp_path.iterdir()} == {CSV}

@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import gvo
-from gvo.batch.inputs import Variant, differences, make_variants, name_variants
-from gvo.config import Config
+from gvo.batch import Variant, make_variants
 from gvo.errors import ConfigurationError
 
 
@@ -136,41 +135,3 @@ def test_a_file_that_is_no_configuration_is_named(tmp_path: Path) -> None:
         make_variants([tmp_path / "a.yaml"])
     with pytest.raises(ConfigurationError, match=r"none\.yaml: No such file"):
         make_variants([tmp_path / "none.yaml"])
-
-
-def with_size(size: int) -> Config:
-    return gvo.load_configuration(settings=[f"window.size={size}"])
-
-
-def test_configurations_are_named_by_what_they_differ_in() -> None:
-    named = name_variants([with_size(4), with_size(6), with_size(4)])
-    assert [each.name for each in named] == ["window.size=4", "window.size=6", "window.size=4-2"]
-    assert [values_of(each)[0] for each in named] == [4, 6, 4]
-    assert [each.name for each in name_variants([Config(), Config()])] == ["default", "default-2"]
-
-
-def test_configurations_keep_names_that_are_given_to_them() -> None:
-    named = name_variants({"a": with_size(4), "../b": with_size(6), "..": with_size(7)})
-    assert [values_of(each)[0] for each in named] == [4, 6, 7]
-    assert named[0].name == "a"
-    assert all("/" not in each.name and not each.name.startswith(".") for each in named)
-
-
-def test_one_configuration_is_the_default_and_none_is_that_of_gvo() -> None:
-    assert [each.name for each in name_variants(with_size(4))] == ["default"]
-    assert name_variants(None)[0].config.runtime.threads == 1
-    with pytest.raises(ConfigurationError, match="at least one"):
-        name_variants([])
-
-
-def test_only_what_differs_is_told() -> None:
-    settings: tuple[list[str], ...] = (["window.size=4"], ["window.size=4", "window.gate=null"], [])
-    found = differences([gvo.load_configuration(settings=list(each)) for each in settings])
-    default = Config()
-    assert found == [
-        {"window.size": 4, "window.gate": default.window.gate},
-        {"window.size": 4, "window.gate": None},
-        {"window.size": default.window.size, "window.gate": default.window.gate},
-    ]
-    assert differences([Config()]) == [{}]
-    assert differences([]) == []
