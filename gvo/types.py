@@ -11,7 +11,7 @@ from typing import Any, Literal, Protocol, TypeAlias, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from gvo._html import estimate_html
+from gvo._text import format_stamp
 from gvo.config import Kernel
 
 FloatArray: TypeAlias = NDArray[np.float64]
@@ -528,11 +528,13 @@ class Estimate:
         """Copy the arrays."""
         _freeze(self, T_world_frame=(4, 4), covariance=(6, 6))
 
-    def _repr_html_(self) -> str:
-        """Return a table for notebooks."""
-        return estimate_html(
-            self.stamp_ns, self.T_world_frame, self.covariance, status=self.status.value
-        )
+    def __repr__(self) -> str:
+        """Return one line: stamp, position with its standard deviations, status."""
+        R, position = self.T_world_frame[:3, :3], self.T_world_frame[:3, 3]
+        with np.errstate(invalid="ignore", over="ignore"):
+            sigmas = np.sqrt(np.diag(R @ self.covariance[3:, 3:] @ R.T))
+        x, y, z = (f"{p:.3f} ± {s:.2g}" for p, s in zip(position, sigmas, strict=True))
+        return f"Estimate({format_stamp(self.stamp_ns)} s, ({x}, {y}, {z}) m, {self.status.value})"
 
 
 LinkKind: TypeAlias = Literal["step", "keyframe", "depth"]

@@ -1,4 +1,4 @@
-"""ROS 2 without a ROS installation: its topics, services and parameters over CycloneDDS.
+"""ROS 2 without a ROS installation: its topics and services over CycloneDDS.
 
 The topic `/a/b` of ROS 2 is `rt/a/b` on a DDS network, its type `package::msg::dds_::Name_`, and
 its bytes are CDR as in a bag. The classes that CycloneDDS wants for them are made from the
@@ -13,21 +13,19 @@ import re
 import socket
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
 
-import numpy as np
 from rosbags.interfaces import Nodetype
 
 from gvo._text import cut
-from gvo.config import list_parameters, values_by_name
 from gvo.errors import ConfigurationError, GvoError, missing_extra
 from gvo.io.bag.reader import typestore
 from gvo.io.bag.topics import IMAGE_TYPES, Topic
-from gvo.live.transport import OnMessage, Parameters, Service, ServiceType, decode
+from gvo.live.transport import OnMessage, Parameters, Service, decode
 
 try:
     from cyclonedds import builtin, core, domain, pub, sub, topic, util
@@ -37,7 +35,6 @@ except ImportError as error:
     raise missing_extra("gvo live ros2 needs CycloneDDS", "dds") from error
 
 ImageQos: TypeAlias = Literal["sensor", "reliable", "system"]
-_Fields: TypeAlias = Mapping[str, Any]
 Receive: TypeAlias = Callable[[Any], None]
 
 _LOGGER = logging.getLogger(__name__)
@@ -59,15 +56,6 @@ _CODING, _ASKED = slice(0, 4), slice(4, 20)
 _ANSWERED_WITHIN_S = 2.0
 
 _BASES: Final = {"bool": bool, "string": str, "byte": types.uint8, "char": types.uint8}
-_VALUES: Final[dict[type, str]] = {  # of rcl_interfaces, in the order of their numbers
-    type(None): "not set",
-    bool: "bool_value",
-    int: "integer_value",
-    float: "double_value",
-    str: "string_value",
-}
-_LIST = "uint64 DEPTH_RECURSIVE=0\nstring[] prefixes\nuint64 depth"
-_NAMES, _NEW = "string[] names", "Parameter[] parameters"
 
 
 class Dds:
@@ -118,7 +106,7 @@ class Dds:
             self.subscribe(_CLOCK.name, _CLOCK.type, self._set_clock)
         return topics
 
-    def subscribe(self, topic: str, type_: str, callback: OnMessage) -> Callable[[], None]:
+    def subscribe(self, topic: str, type_: str, callback: OnMessage) -> None:
         """Receive the messages of a topic; see `Transport`."""
         is_image = type_ in IMAGE_TYPES
         offers = [each.qos for each in self._writers() if each.topic_name == f"rt{topic}"]
@@ -134,7 +122,7 @@ class Dds:
         n_kept = _N_IMAGES if is_image else _N_OTHERS
         qos = _qos(n_kept, is_reliable=is_reliable, is_held=is_held)
         reader = sub.DataReader(self._participant, self._topic(f"rt{topic}", type_), qos)
-        return self._read(reader, lambda sample: callback(sample.payload, self._now_ns()))
+        self._read(reader, lambda sample: callback(sample.payload, self._now_ns()))
 
     def advertise(self, topic: str, type_: str, *, is_latched: bool = False) -> DdsPublisher:
         """Open a topic for writing; see `Sink`."""
@@ -152,9 +140,7 @@ class Dds:
         self._read(reader, partial(_answer, service, reader, writer))
 
     def offer(self, parameters: Parameters) -> None:
-        """Serve the parameter services of a node `/gvo`."""
-        for service in _ParameterServices(parameters).all():
-            self.serve(service)
+        """Offer none: they are changed on the page and in Foxglove."""
 
     def close(self) -> None:
         """Leave the network."""
@@ -165,9 +151,8 @@ class Dds:
     def _topic(self, name: str, type_: str, kind: str = "msg") -> topic.Topic[Any]:
         return topic.Topic(self._participant, name, message_class(type_, kind))
 
-    def _read(self, reader: sub.DataReader[Any], receive: Receive) -> Callable[[], None]:
+    def _read(self, reader: sub.DataReader[Any], receive: Receive) -> None:
         self._readings.append(_Reading(self._participant, reader, receive))
-        return self._readings[-1].close
 
     def _writers(self) -> list[builtin.DcpsEndpoint]:
         """Return what others write with."""
@@ -224,8 +209,7 @@ class _Reading:
         """Receive nothing more."""
         if self._thread.is_alive():
             self._end.set(True)
-            if self._thread is not threading.current_thread():
-                self._thread.join()
+            self._thread.join()
 
     def _run(self) -> None:
         while not self._end.read():
@@ -233,85 +217,6 @@ class _Reading:
                 if sample.sample_info.valid_data:
                     self._receive(sample)
             self._waitset.wait(util.duration(infinite=True))
-
-
-class _ParameterServices:
-    """The services by which parameters of a node of ROS 2 are seen and changed."""
-
-    def __init__(self, parameters: Parameters) -> None:
-        self._parameters = parameters
-        self._known = {
-            f"{section}.{each.key}": each
-            for section, members in list_parameters().items()
-            for each in members
-        }
-
-    def all(self) -> list[Service]:
-        """Return them."""
-        return [
-            Service(
-                name=f"/gvo/{re.sub('(?<!^)(?=[A-Z])', '_', name).lower()}",
-                type=ServiceType(name=f"rcl_interfaces/srv/{name}", request=asked, response=given),
-                answer=answer,
-            )
-            for name, asked, given, answer in (
-                ("ListParameters", _LIST, "ListParametersResult result", self._list),
-                ("GetParameters", _NAMES, "ParameterValue[] values", self._get),
-                ("GetParameterTypes", _NAMES, "uint8[] types", self._get_types),
-                ("DescribeParameters", _NAMES, "ParameterDescriptor[] descriptors", self._describe),
-                ("SetParameters", _NEW, "SetParametersResult[] results", self._set_each),
-                ("SetParametersAtomically", _NEW, "SetParametersResult result", self._set_all),
-            )
-        ]
-
-    def _list(self, asked: Any) -> _Fields:  # noqa: ANN401 - made at run time
-        names = [name for name in self._known if _is_below(name, asked.prefixes, asked.depth)]
-        sections = sorted({name.partition(".")[0] for name in names})
-        return {"result": _made("ListParametersResult", names=names, prefixes=sections)}
-
-    def _get(self, asked: Any) -> _Fields:  # noqa: ANN401
-        return {"values": [_value_message(self._value(name)) for name in asked.names]}
-
-    def _get_types(self, asked: Any) -> _Fields:  # noqa: ANN401
-        return {"types": np.array([_kind(self._value(name)) for name in asked.names], np.uint8)}
-
-    def _describe(self, asked: Any) -> _Fields:  # noqa: ANN401
-        return {"descriptors": [self._descriptor(name) for name in asked.names]}
-
-    def _set_each(self, asked: Any) -> _Fields:  # noqa: ANN401
-        return {"results": [self._set([each]) for each in asked.parameters]}
-
-    def _set_all(self, asked: Any) -> _Fields:  # noqa: ANN401
-        return {"result": self._set(asked.parameters)}
-
-    def _set(self, changes: Sequence[Any]) -> Any:  # noqa: ANN401
-        reason = ""
-        try:
-            self._parameters.set({each.name: _value_of(each.value) for each in changes})
-        except GvoError as error:
-            reason = str(error)
-        return _made("SetParametersResult", successful=not reason, reason=reason)
-
-    def _value(self, name: str) -> object:
-        return values_by_name(self._parameters.config).get(name)
-
-    def _descriptor(self, name: str) -> Any:  # noqa: ANN401
-        known, whole, real = self._known.get(name), [], []
-        if known and known.minimum is not None and known.maximum is not None:
-            low, high = known.minimum, known.maximum
-            if known.kind == "integer":
-                whole = [_made("IntegerRange", from_value=int(low), to_value=int(high), step=1)]
-            else:
-                real = [_made("FloatingPointRange", from_value=low, to_value=high, step=0.0)]
-        return _made(
-            "ParameterDescriptor",
-            **{"name": name, "type": _kind(self._value(name)), "read_only": False},
-            description=known.hint if known else "",
-            additional_constraints=", ".join(known.choices) if known else "",
-            dynamic_typing=bool(known and known.is_optional),
-            integer_range=whole,
-            floating_point_range=real,
-        )
 
 
 @cache
@@ -418,33 +323,3 @@ def _wait_for_reader(writer: pub.DataWriter[Any], client: builtin.DcpsEndpoint |
         if any(each and each.participant_key == client.participant_key for each in readers):
             return
         time.sleep(0.005)
-
-
-def _is_below(name: str, prefixes: Sequence[str], depth: int) -> bool:
-    """Tell whether a name is below one of the prefixes, at most so deep; 0 is any depth."""
-    within = [prefix for prefix in prefixes if f"{name}.".startswith(f"{prefix}.")]
-    below = [name.removeprefix(f"{prefix}.") for prefix in within] if prefixes else [name]
-    return any(depth == 0 or rest.count(".") < depth for rest in below)
-
-
-def _made(type_: str, **fields: Any) -> Any:  # noqa: ANN401
-    return typestore(is_ros1=False).types[f"rcl_interfaces/msg/{type_}"](**fields)
-
-
-def _kind(value: object) -> int:
-    return list(_VALUES).index(type(value))
-
-
-def _value_message(value: object) -> Any:  # noqa: ANN401
-    fields = {field: kind() for kind, field in list(_VALUES.items())[1:]}
-    arrays = ("byte", "bool", "integer", "double", "string")
-    fields |= {f"{element}_array_value": np.zeros(0) for element in arrays}
-    if value is not None:
-        fields[_VALUES[type(value)]] = value
-    return _made("ParameterValue", type=_kind(value), **fields)
-
-
-def _value_of(message: Any) -> object:  # noqa: ANN401
-    if message.type >= len(_VALUES):
-        raise ConfigurationError("no parameter is an array")
-    return getattr(message, list(_VALUES.values())[message.type], None)

@@ -16,9 +16,9 @@ import sys
 import threading
 import time
 import xmlrpc.client
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from http.client import HTTPException
 from importlib import import_module
 from importlib.util import find_spec
@@ -43,7 +43,6 @@ _MASTER_TIMEOUT_S = 5.0
 _FLUSH_TIMEOUT_S = 2.0
 _N_QUEUED = 100
 _READ_BYTES = 1 << 20
-_MAX_MESSAGE = 1 << 28
 
 
 class Ros1:
@@ -100,16 +99,15 @@ class Ros1:
             if name in others
         ]
 
-    def subscribe(self, topic: str, type_: str, callback: OnMessage) -> Callable[[], None]:
+    def subscribe(self, topic: str, type_: str, callback: OnMessage) -> None:
         """Receive the messages of a topic, see `Transport`."""
 
         def receive(message: Any) -> None:  # noqa: ANN401 - of a class made at run time
             callback(message.data, self._rospy.get_rostime().to_nsec())
 
-        subscriber = self._rospy.Subscriber(
+        self._rospy.Subscriber(
             topic, _message_class(type_), receive, buff_size=_READ_BYTES, tcp_nodelay=True
         )
-        return partial(subscriber.unregister)
 
     def advertise(self, topic: str, type_: str, *, is_latched: bool = False) -> _Publisher:
         """Open a topic for writing; `~name` is one of the node's own."""
@@ -184,22 +182,7 @@ def _import_rospy() -> Any:  # noqa: ANN401 - has no types
         ) from error
     finally:
         logging.setLoggerClass(logger_class)  # rospy has its own for all
-    _bound_messages(import_module("rospy.impl.tcpros_base"))
     return rospy
-
-
-def _bound_messages(tcpros: Any) -> None:  # noqa: ANN401
-    """Let rospy drop who sends a message without end."""
-    read = tcpros.recv_buff
-    if read.__module__ == __name__:
-        return
-
-    def recv_buff(connection: socket.socket, buffer: BytesIO, size: int) -> int:
-        if buffer.tell() > _MAX_MESSAGE:
-            raise tcpros.TransportTerminated(f"a message of more than {_MAX_MESSAGE} bytes")
-        return int(read(connection, buffer, size))
-
-    tcpros.recv_buff = recv_buff
 
 
 def _find_master() -> str:
@@ -295,7 +278,6 @@ class _Reconfigure:
     def __init__(self, node: Ros1, parameters: Parameters, *, warn: Callable[[str], None]) -> None:
         self._parameters, self._warn = parameters, warn
         self._known = _known_parameters()
-        self._closed: set[str] = set()  # groups that a client shows folded
         self._tell_config = _opened(node, "~parameter_updates", "Config")
         _opened(node, "~parameter_descriptions", "ConfigDescription")(self._description())
         self._tell(parameters.config)
@@ -306,12 +288,9 @@ class _Reconfigure:
         self._tell_config(self._state(config))
 
     def _state(self, config: Config) -> Any:  # noqa: ANN401 - made at run time
-        return _config(self._values(config), list_parameters(), closed=self._closed)
+        return _config(self._values(config), list_parameters())
 
     def _set(self, request: Any) -> dict[str, Any]:  # noqa: ANN401 - made at run time
-        if groups := request.config.groups:
-            closed = {group.name for group in groups if not group.state}
-            self._closed = closed & {*list_parameters()}
         try:
             self._parameters.set(self._wanted(request.config))
         except ConfigurationError as error:
@@ -393,16 +372,14 @@ def _enumeration(parameter: Parameter) -> str:
     return repr({"enum": choices, "enum_description": parameter.hint}) if choices else ""
 
 
-def _config(
-    values: Mapping[str, Any], sections: Iterable[str] = (), *, closed: Container[str] = ()
-) -> Any:  # noqa: ANN401 - made at run time
-    """Return a message of values, and of groups, some closed, where sections are given."""
+def _config(values: Mapping[str, Any], sections: Iterable[str] = ()) -> Any:  # noqa: ANN401
+    """Return a message of values, and of groups where sections are given."""
     lists: dict[str, list[Any]] = {f"{type_}s": [] for type_ in _TYPES.values()}
     for name, value in values.items():
         type_ = _TYPES[type(value)]
         lists[f"{type_}s"].append(_make(f"{type_.capitalize()}Parameter", name=name, value=value))
     groups = [
-        _make("GroupState", name=name, state=name not in closed, id=index, parent=0)
+        _make("GroupState", name=name, state=True, id=index, parent=0)
         for index, name in enumerate(["Default", *sections] if sections else [])
     ]
     return _make("Config", groups=groups, **lists)

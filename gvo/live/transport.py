@@ -82,7 +82,7 @@ class Transport(Sink, Protocol):
     def topics(self) -> Sequence[Topic]:
         """Return what others announce now, each with one message at least."""
 
-    def subscribe(self, topic: str, type_: str, callback: OnMessage) -> Callable[[], None]:
+    def subscribe(self, topic: str, type_: str, callback: OnMessage) -> None:
         """Receive the messages of a topic, those that are latched too.
 
         Parameters
@@ -92,11 +92,6 @@ class Transport(Sink, Protocol):
         callback : callable
             Takes the bytes of a message, and the time by the clock of the transport, nanoseconds
             (simulated, where that is the clock). Called in a thread of the transport.
-
-        Returns
-        -------
-        callable
-            Ends it.
         """
 
 

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from gvo._html import card, metres
 from gvo._text import format_stamp as format_stamp
 from gvo._text import plain_number, shortened
 from gvo.geometry import se3
@@ -130,20 +129,6 @@ class Trajectory:
             f"{path_m:.2f} m{rotations}{covariances})"
         )
 
-    def _repr_html_(self) -> str:
-        """Return a table for notebooks."""
-        rows = [("poses", f"{len(self):,}{'' if self.has_rotations else ', positions only'}")]
-        if len(self) == 0:
-            return card("Trajectory", rows)
-        if self.stamps_from != "rows":
-            rows += _rows_of_stamps(int(self.stamps_ns[0]), int(self.stamps_ns[-1]), len(self))
-        with np.errstate(over="ignore"):
-            extents = np.ptp(self.positions, axis=0)
-            rows.append(("path length", metres(float(self.distances()[-1]))))
-        rows.append(("extent x, y, z", ", ".join(metres(float(extent)) for extent in extents)))
-        rows.append(("covariances", "none" if self.covariances is None else "yes"))
-        return card("Trajectory", rows)
-
     @property
     def positions(self) -> FloatArray:
         """Camera centres in the world, shape (n, 3), metres."""
@@ -258,18 +243,6 @@ class Trajectory:
         shares = ((wanted - self.stamps_ns[before]) / spans)[:, np.newaxis]
         poses = _between(self.T_world_frame[before], self.T_world_frame[after], shares)
         return replace(self, stamps_ns=wanted, T_world_frame=poses, covariances=None)
-
-
-def _rows_of_stamps(first_ns: int, last_ns: int, n: int) -> list[tuple[str, str]]:
-    duration_s = (last_ns - first_ns) / 1e9
-    rows = [
-        ("from", f"{format_stamp(first_ns)} s"),
-        ("to", f"{format_stamp(last_ns)} s"),
-        ("duration", f"{duration_s:,.3f} s"),
-    ]
-    if n > 1:
-        rows.append(("mean rate", f"{(n - 1) / duration_s:.3g} Hz"))
-    return rows
 
 
 def _checked_stamps(stamps_ns: IntArray) -> IntArray:

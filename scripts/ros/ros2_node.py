@@ -52,9 +52,7 @@ class Node:
         known = self._node.get_topic_names_and_types()
         return [Topic(name=n, type=t[0], n_messages=1) for n, t in known if self._offers(n)]
 
-    def subscribe(
-        self, topic: str, type_: str, callback: Callable[[bytes, int], None]
-    ) -> Callable[[], None]:
+    def subscribe(self, topic: str, type_: str, callback: Callable[[bytes, int], None]) -> None:
         """Receive messages as bytes, held and sent again where all writers offer it."""
         offers, clock = self._offers(topic), self._node.get_clock()
         reliable, held = ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL
@@ -65,8 +63,7 @@ class Node:
             qos.durability = held
         take = lambda data: callback(data, clock.now().nanoseconds)  # noqa: E731
         options = {"raw": True, "callback_group": self._group}
-        made = self._node.create_subscription(get_message(type_), topic, take, qos, **options)
-        return lambda: self._node.destroy_subscription(made)
+        self._node.create_subscription(get_message(type_), topic, take, qos, **options)
 
     def advertise(self, topic: str, type_: str, *, is_latched: bool = False) -> Outlet:
         """Open a topic for writing."""

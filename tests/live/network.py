@@ -50,15 +50,12 @@ class Network:
     def topics(self) -> Sequence[Topic]:
         return [*self.announced]
 
-    def subscribe(
-        self, topic: str, type_: str, callback: Callable[[bytes, int], None]
-    ) -> Callable[[], None]:
+    def subscribe(self, topic: str, type_: str, callback: Callable[[bytes, int], None]) -> None:
         assert Topic(name=topic, type=type_, n_messages=1) in self.announced
         with self.changed:
             assert topic not in self._callbacks, "subscribed twice"
             self._callbacks[topic] = callback
             self.changed.notify_all()
-        return lambda: None
 
     def advertise(self, topic: str, type_: str, *, is_latched: bool = False) -> Outlet:
         assert topic not in self.opened, "announced twice"

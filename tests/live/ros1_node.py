@@ -11,7 +11,6 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-import gvo.live.ros1
 from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.io.bag.topics import CAMERA_INFO_TYPE, IMAGE_TYPE
@@ -40,7 +39,6 @@ def set_pose(request: Any) -> dict[str, object]:
 
 
 def main() -> None:
-    gvo.live.ros1._MAX_MESSAGE = 1 << 20
     node = Ros1(["__name:=vo", "/gvo/latched:=/renamed"])
     latched = node.advertise("/gvo/latched", POINT, is_latched=True)
     plain = node.advertise("/gvo/plain", POINT)
@@ -76,11 +74,9 @@ def main() -> None:
     node.serve(Service(name="/gvo/set_pose", type=SET_POSE, answer=set_pose))
     tell("topics", topics=[[topic.name, topic.type] for topic in node.topics()])
     node.subscribe("/cam/camera_info", CAMERA_INFO_TYPE, told("info", CAMERA_INFO_TYPE))
-    end = node.subscribe("/cam/image", IMAGE_TYPE, told("image", IMAGE_TYPE))
+    node.subscribe("/cam/image", IMAGE_TYPE, told("image", IMAGE_TYPE))
     tell("ready")
-    for _ in sys.stdin:
-        end()
-        tell("ended")
+    sys.stdin.read()
     node.close()
     threads = [one for one in threading.enumerate() if not one.daemon]
     for thread in set(threads) - {threading.main_thread()}:
