@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-PAGE = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs/CONTRIBUTING.md").read_text(encoding="utf-8")
 PACKAGES = sorted(path.parent for path in (ROOT / "gvo").rglob("__init__.py"))
 
 

@@ -22,7 +22,9 @@ DOCKER = ROOT / "scripts/docker/Dockerfile"
 def two_commands() -> list[str]:
     block = re.search(r"^```\n(.*?)^```", README, re.DOTALL | re.MULTILINE)
     assert block is not None
-    return block[1].splitlines()
+    clone, *commands = block[1].splitlines()
+    assert clone.startswith("git clone <this repository> ")
+    return commands
 
 
 def jobs() -> dict[str, Any]:

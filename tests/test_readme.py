@@ -48,7 +48,9 @@ def unknown(span: str) -> list[str]:
     return sorted({*re.findall(r"(?<!\S)--?[a-zA-Z][\w-]*", found[2])} - COMMANDS[found[1]])
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if page.name != "CHANGELOG.md"], ids=lambda page: page.name
+)
 def test_commands_and_options_within_sentences_are_there(page: Path) -> None:
     assert [span for span in spans(page) if unknown(span)] == []
 
@@ -57,12 +59,6 @@ def test_what_is_not_there_is_seen() -> None:
     assert unknown("gvo run FILE --bag B -v") == []
     assert unknown("gvo runs") == ["runs"]
     assert unknown("gvo run --smooth") == ["--smooth"]
-
-
-def test_options_that_the_readme_names_alone_are_there() -> None:
-    named = {span.split()[0] for span in spans(ROOT / "README.md") if span.startswith("-")}
-    assert len(named) > 2
-    assert named <= set().union(*COMMANDS.values())
 
 
 def compared() -> dict[str, tuple[str, str]]:

@@ -72,7 +72,7 @@ def workplace(clone: Path, room_bag: Path) -> Path:
     for name in ("drive.mcap", "robot.mcap"):
         shutil.copy(clone / "gvo-demo" / name, clone / name)
     shutil.copy(room_bag, clone / "room.bag")
-    (shown,) = (block for page, block in blocks("yaml") if page == "own-camera.md")
+    (shown,) = (block for page, block in blocks("yaml") if page == "live.md")
     (clone / "stereo.yaml").write_text(shown)
     return clone
 
@@ -144,7 +144,7 @@ def test_the_shown_check_has_the_lines_of_a_real_one(workplace: Path, command: C
         return [re.split(r"  +", line)[0] for line in text.splitlines()]
 
     answer = command("check", "drive.mcap")
-    assert names(shown_after("check.md", "gvo check drive.mcap")) == names(answer.out)
+    assert names(shown_after("recordings.md", "gvo check drive.mcap")) == names(answer.out)
 
 
 def test_the_shown_run_has_the_decisions_of_a_real_one(workplace: Path, command: Command) -> None:
@@ -159,15 +159,19 @@ def test_all_encodings_and_lenses_are_listed() -> None:
 
 
 def test_all_lines_of_a_check_are_listed() -> None:
-    page = (ROOT / "docs/check.md").read_text()
+    page = (ROOT / "docs/recordings.md").read_text()
     names = [rule.removeprefix("transform ") for rule in RULES]
     assert [name for name in names if not re.search(rf"`[^`]*\b{name}`", page)] == []
 
 
 def test_all_topics_of_the_bag_of_a_run_are_listed(workplace: Path, command: Command) -> None:
     assert command("run", "drive.mcap", "--out", "out", "--bag", "run.mcap").code == 0
-    page = (ROOT / "docs/bags.md").read_text()
-    rows = [line for line in page.splitlines() if line.startswith("| `/")]
+    page = (ROOT / "docs/results.md").read_text()
+    rows = [
+        line
+        for line in page.partition("\n## A run as a bag\n")[2].splitlines()
+        if line.startswith("| `/")
+    ]
     shown = {
         (name, kind.replace("/", "/msg/"))
         for _, names, kind, *_ in (row.replace("`", "").split("|") for row in rows)

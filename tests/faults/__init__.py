@@ -1,4 +1,4 @@
-"""Faults of recordings: those of the table in docs/reliability.md."""
+"""Faults of recordings: those of the table in docs/SECURITY.md."""
 
 from gvo.testing.faults import Black as Black
 from gvo.testing.faults import Dropped as Dropped

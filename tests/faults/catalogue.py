@@ -1,4 +1,4 @@
-"""The faults of docs/reliability.md: how they are made, and what the page says of them."""
+"""The faults of docs/SECURITY.md: how they are made, and what the page says of them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gvo.io.recording import Sensor, Source
 from gvo.testing.faults import Fault, FaultySource, PixelFault
 from tests import faults as made
 
-PAGE = Path(__file__).parents[2] / "docs/reliability.md"
+PAGE = Path(__file__).parents[2] / "docs/SECURITY.md"
 _SENSORS: dict[str | None, tuple[Sensor, ...]] = {
     None: ("stereo", "rgbd"),
     "stereo": ("stereo",),

@@ -1,4 +1,4 @@
-"""Each row of the table in docs/reliability.md, over rendered recordings with exact poses."""
+"""Each row of the table in docs/SECURITY.md, over rendered recordings with exact poses."""
 
 from __future__ import annotations
 
