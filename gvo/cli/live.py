@@ -78,7 +78,7 @@ def live(
     with_report: opt.Report = True,
 ) -> None:
     """Track a running camera: of ROS, through a pipe, or a device."""
-    from gvo.io.poses.inputs import find_base_frame
+    from gvo.io.poses.base_frame import find_base_frame
     from gvo.live.odometry import LiveOdometry
     from gvo.runs.outputs.options import RunOutputs
 
@@ -183,7 +183,7 @@ def _wait(
     network: Sink, config: Config, options: RecordingOptions, end: _End, frame: str | None
 ) -> tuple[Source, BaseFrame]:
     """Return the camera and the frame whose poses are wanted, once all about both is known."""
-    from gvo.io.poses.inputs import find_base_frame
+    from gvo.io.poses.base_frame import find_base_frame
     from gvo.live.topics import NetworkReader, TopicSource, wait_for
 
     reader = NetworkReader(cast("Transport", network))

@@ -134,8 +134,8 @@ def run(
     options: opt.Options,
 ) -> None:
     """Estimate the trajectory of a recording, with covariances."""
-    from gvo.io.poses.base_frame import parse_initial_pose
-    from gvo.io.poses.inputs import find_base_frame, read_truth
+    from gvo.io.poses.base_frame import find_base_frame, parse_initial_pose
+    from gvo.io.poses.inputs import read_truth
     from gvo.runs.outputs.options import RunOutputs
     from gvo.runs.run import run_recording
 
@@ -182,7 +182,7 @@ def check_(
 ) -> None:
     """Look for what would make odometry fail, before it runs."""
     from gvo.diagnostics.check import check_recording, format_check
-    from gvo.io.poses.inputs import read_transforms
+    from gvo.io.bag.source import read_transforms
 
     source = opt.open_source(recordings, parameters, options)
     result = check_recording(

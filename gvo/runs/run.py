@@ -14,16 +14,12 @@ import numpy as np
 
 from gvo.config import Config
 from gvo.errors import GvoError, RecordingError
+from gvo.io.bag.source import CAMERA_CHANGED, describe_camera_changes
 from gvo.io.excerpt import Excerpt
 from gvo.io.frames import Through
 from gvo.io.poses.base_frame import BaseFrame
-from gvo.io.poses.inputs import (
-    CAMERA_CHANGED,
-    describe_camera_changes,
-    initial_pose,
-    recorded_truth,
-)
-from gvo.io.poses.truth import Truth, TruthComparison
+from gvo.io.poses.inputs import recorded_truth
+from gvo.io.poses.truth import Truth, TruthComparison, initial_pose
 from gvo.io.recording import Source
 from gvo.io.run_folder.reader import read_run, trajectory_names
 from gvo.io.run_folder.writer import GLOBAL, PICTURE, REPORT, RunFolder, save_summary, written_alone

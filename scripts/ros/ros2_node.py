@@ -19,7 +19,7 @@ from rclpy.utilities import remove_ros_args
 from rosidl_runtime_py.utilities import get_message, get_service
 
 from gvo.io.bag.topics import Topic
-from gvo.io.poses.inputs import find_base_frame
+from gvo.io.poses.base_frame import find_base_frame
 from gvo.live import LiveOdometry, NetworkReader, Parameters, Service, TopicSource, wait_for
 
 

@@ -37,7 +37,7 @@ from gvo.io.calibration.files import read_cameras
 from gvo.io.datasets.files import read_stamped_rows
 from gvo.io.edges.lines import parse_line, read_lines
 from gvo.io.images import MAX_PIXELS, decode_image, read_image
-from gvo.io.poses.ground_truth import parse_truth
+from gvo.io.poses.truth import parse_truth
 from gvo.io.run_folder.reader import read_run
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.g2o import Measurement

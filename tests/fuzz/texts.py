@@ -14,7 +14,7 @@ from gvo.io.edges.opening import open_edges, parse_sigma
 from gvo.io.edges.pose_graph import PoseGraphSource
 from gvo.io.opening import open_recording
 from gvo.io.poses.base_frame import parse_initial_pose
-from gvo.io.poses.ground_truth import parse_bag_truth, parse_truth
+from gvo.io.poses.truth import parse_bag_truth, parse_truth
 from gvo.io.recording import StampedImage
 from gvo.io.run_folder.writer import RunFolder
 from gvo.runs.smooth import POSES_HEADER, Smoother

@@ -7,7 +7,8 @@ import pytest
 
 import gvo
 from gvo.errors import RecordingError
-from gvo.io.poses.inputs import find_base_frame, read_truth
+from gvo.io.poses.base_frame import find_base_frame
+from gvo.io.poses.inputs import read_truth
 from gvo.runs.demo import BAG_NAME, ROBOT_NAME, run_demo, write_robot_bag
 
 

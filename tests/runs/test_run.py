@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 import gvo
 from gvo.errors import RecordingError, SmoothingError, TrajectoryError
 from gvo.geometry import se3
-from gvo.io.poses.inputs import find_base_frame, read_truth
+from gvo.io.poses.base_frame import find_base_frame
+from gvo.io.poses.inputs import read_truth
 from gvo.io.synthetic import SyntheticRecording
 from gvo.odometry.odometry import Odometry
 from gvo.runs.loop import Output, RunLoop

@@ -8,9 +8,9 @@ import numpy as np
 
 from gvo.diagnostics.check.findings import Finding, judged, unknown
 from gvo.diagnostics.check.limits import measured
-from gvo.io.poses.ground_truth import TRUTH_FRAMES
+from gvo.io.bag.messages import bare
 from gvo.io.poses.tf import TfBuffer
-from gvo.io.poses.tf_paths import bare
+from gvo.io.poses.truth import TRUTH_FRAMES
 from gvo.types import Failure, IntArray
 
 _N_NAMED = 5

@@ -17,7 +17,7 @@ from gvo.diagnostics.check.stereo import check_stereo
 from gvo.diagnostics.check.timing import check_shutter, check_timing
 from gvo.errors import CalibrationError
 from gvo.geometry.camera import PinholeCamera, StereoCamera
-from gvo.io.poses.inputs import CAMERA_CHANGED, describe_camera_changes
+from gvo.io.bag.source import CAMERA_CHANGED, describe_camera_changes
 from gvo.io.poses.tf import TfBuffer
 from gvo.io.recording import RecordingInfo, Source
 from gvo.types import Failure

@@ -13,7 +13,13 @@ import numpy as np
 
 from gvo.errors import CalibrationError, RecordingError
 from gvo.io.bag.file import BagFile
-from gvo.io.bag.messages import camera_fields, decode_compressed, decode_compressed_depth, stamp_of
+from gvo.io.bag.messages import (
+    bare,
+    camera_fields,
+    decode_compressed,
+    decode_compressed_depth,
+    stamp_of,
+)
 from gvo.io.bag.reader import BagMessage, BagReader, MessageReader
 from gvo.io.bag.topics import (
     CAMERA_INFO_TYPE,
@@ -25,7 +31,6 @@ from gvo.io.bag.topics import (
     find_camera_info,
 )
 from gvo.io.calibration.camera_info import CameraFields
-from gvo.io.poses.tf_paths import bare
 
 # Written by a run for viewers, beside the poses.
 _OF_RUN = "/gvo/"

@@ -31,7 +31,6 @@ from gvo.io.images import (
     is_png,
     to_8_bit,
 )
-from gvo.io.poses.tf_paths import bare
 from gvo.trajectory.formats import MAX_POSITION_M
 from gvo.types import DepthArray, Failure, FloatArray, ImageArray
 
@@ -45,6 +44,11 @@ _COMPRESSED_DEPTH_HEADER = struct.Struct("<iff")
 def stamp_of(header: ros.std_msgs__msg__Header) -> int:
     """Return the stamp of a header of ROS 1 or ROS 2 in nanoseconds."""
     return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+
+
+def bare(name: str) -> str:
+    """Return the name of a frame without a leading slash."""
+    return name.removeprefix("/")
 
 
 def transform_of(translation: Any, rotation: Any) -> FloatArray | Failure:  # noqa: ANN401

@@ -12,12 +12,11 @@ import numpy as np
 from gvo.errors import RecordingError
 from gvo.geometry import se3
 from gvo.geometry.geodesy import local_enu
-from gvo.io.bag.messages import stamp_of, transform_of
+from gvo.io.bag.messages import bare, stamp_of, transform_of
 from gvo.io.bag.reader import BagReader, MessageReader
 from gvo.io.bag.topics import Topic, describe_topics, find_topic
 from gvo.io.edges.events import InputFaults
 from gvo.io.edges.pose_streams import PoseSample
-from gvo.io.poses.tf_paths import bare
 from gvo.trajectory.trajectory import StampsFrom
 from gvo.types import Failure, FloatArray, IntArray
 

@@ -31,13 +31,16 @@ from gvo.io.bag.topics import (
 )
 from gvo.io.calibration.files import CalibrationPaths, paths_of
 from gvo.io.images import MILLIMETRES, GreyRange
-from gvo.io.poses.ground_truth import TRUTH_FRAMES, BagTruthSpec
 from gvo.io.poses.tf import TfBuffer, read_tf
-from gvo.io.poses.truth import Truth, find_truth
-from gvo.io.recording import RecordingInfo, StampedImage
+from gvo.io.poses.truth import TRUTH_FRAMES, BagTruthSpec, Truth, find_truth
+from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FloatArray
 
+CAMERA_CHANGED = (
+    "the first one is used; give the right one by --calibration FILE, or cut the bag there"
+)
+"""What follows where a `CameraInfo` changes on the way, and what to do."""
 _N_LISTED = 12
 
 
@@ -162,7 +165,7 @@ class BagSource:
 
         Parameters
         ----------
-        spec : TfTruth or TopicTruth, optional
+        spec : TfTruth or str, optional
             What to read; omitted: what names itself ground truth.
         base_frame : str
             In tf; empty: the rectified left or colour camera.
@@ -174,7 +177,7 @@ class BagSource:
         RecordingError
             When the bag does not hold what was asked for.
         """
-        whole = self.transforms((TRUTH_FRAMES.parent, TRUTH_FRAMES.child))
+        whole = self.transforms(TRUTH_FRAMES)
         return find_truth(
             self._reader,
             spec,
@@ -188,7 +191,7 @@ class BagSource:
     def ground_truth(self) -> Trajectory | None:
         """Return T_world_cam of the rectified camera, where the bag names it ground truth."""
         found = self.truth()
-        return found.trajectory if isinstance(found, Truth) else None
+        return None if isinstance(found, Failure) else found.trajectory
 
     def _describe(self, found: BagCalibration) -> RecordingInfo:
         decisions = [*self._reader.notes, self._topics.describe(), *found.decisions]
@@ -248,3 +251,17 @@ def _describe_parts(paths: Sequence[Path], reader: BagReader, reason: str) -> st
 
 def _fail(reason: str) -> NDArray[Any]:
     raise RecordingError(reason)
+
+
+def read_transforms(source: Source, frames: Collection[str]) -> TfBuffer | None:
+    """Return what a bag knows of frames; None where the recording is no bag."""
+    if not isinstance(source, BagSource):
+        return None
+    return source.transforms([name for name in frames if name])
+
+
+def describe_camera_changes(source: Source) -> str | None:
+    """Say which `CameraInfo` of the images read differ from the one used; None for no bag."""
+    if not isinstance(source, BagSource):
+        return None
+    return ", ".join(f"{n} of {name}" for name, n in source.camera_info_changes.items())

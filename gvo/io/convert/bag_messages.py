@@ -21,7 +21,7 @@ from gvo.geometry.camera import Calibration
 from gvo.io.bag.reader import TF_TYPE, serialize, typestore
 from gvo.io.bag.topics import CAMERA_INFO_TYPE, COMPRESSED_TYPE, IMAGE_TYPE
 from gvo.io.images import MILLIMETRES, encode_image, exact_counts
-from gvo.io.poses.ground_truth import TRUTH_FRAMES
+from gvo.io.poses.truth import TRUTH_FRAMES
 from gvo.types import DepthArray, FloatArray, ImageArray
 
 # Version 8 is read by more releases of ROS 2 than 9, and holds the same.

@@ -197,7 +197,7 @@ def pose_on_body(source: Source) -> FloatArray | None:
     if info.T_body_cam is not None or not isinstance(source, BagSource) or not info.frame_id:
         return info.T_body_cam
     buffer = source.transforms((BODY_FRAME, info.frame_id))
-    if BODY_FRAME not in buffer.frames or not buffer.is_static(BODY_FRAME, info.frame_id):
+    if BODY_FRAME not in buffer.frames or len(buffer.edge_stamps_ns(BODY_FRAME, info.frame_id)):
         return None
     found = buffer.lookup(BODY_FRAME, info.frame_id, 0)
     return None if isinstance(found, Failure) else found

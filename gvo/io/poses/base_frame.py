@@ -18,19 +18,22 @@ from scipy.spatial.transform import Rotation
 from gvo._text import plain_number
 from gvo.errors import ConfigurationError, RecordingError, TrajectoryError
 from gvo.geometry import se3
-from gvo.io.poses.tf import TfBuffer
-from gvo.io.poses.tf_paths import bare, list_names
+from gvo.io.bag.messages import bare
+from gvo.io.bag.source import BagSource
+from gvo.io.poses.tf import TfBuffer, list_names
+from gvo.io.recording import Source
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Edge, Estimate, Failure, FloatArray, IntArray, Loop
 
 InitialPose: TypeAlias = FloatArray | Literal["truth"]
+Mount: TypeAlias = Callable[[int], tuple[FloatArray, bool]]
 
 _NORM_TOLERANCE = 1e-2
 _ROTATION_TOLERANCE = 1e-3
 
 
 class BaseFrame:
-    """Converts poses of the camera into poses of the base frame.
+    """Converts poses of the camera into poses of the base frame, on which it is mounted.
 
     The world is chosen so that the first pose is the initial pose. The first estimate given to
     `apply` is taken for that of the first frame, unless `start` was called.
@@ -40,16 +43,16 @@ class BaseFrame:
     name : str
         Of the frame; empty where it has none.
     T_base_cam : ndarray of float64, shape (4, 4), or callable
-        Maps camera coordinates to the base frame, metres. A function of stamp_ns where the
-        camera moves on it: returns the matrix, and whether it is that of another stamp.
+        Maps camera coordinates to the base frame, metres; omitted for the camera itself. A
+        function of stamp_ns where the camera moves on it: returns the matrix, and whether it is
+        that of another stamp.
     T_initial : ndarray of float64, shape (4, 4), optional
         T_world_base of the first frame, metres; the identity where omitted.
+    origin : str
+        Where its mount comes from, in words; empty for tf and the camera itself.
 
     Attributes
     ----------
-    name : str
-    origin : str
-        Where its mount comes from, in words; empty for tf and the camera itself.
     first_stamp_ns : int or None
         Stamp of the first frame, once it is known.
 
@@ -62,71 +65,25 @@ class BaseFrame:
     def __init__(
         self,
         name: str = "",
-        T_base_cam: FloatArray | Callable[[int], tuple[FloatArray, bool]] | None = None,
+        T_base_cam: FloatArray | Mount | None = None,
         *,
         T_initial: FloatArray | None = None,
+        origin: str = "",
     ) -> None:
         self.name = name
-        self.origin = ""
+        self.origin = origin
         self.first_stamp_ns: int | None = None
         self.is_camera = T_base_cam is None
         self.T_initial = None if T_initial is None else _rigid("T_initial", T_initial)
+        self._mount: FloatArray | Mount
+        if callable(T_base_cam):
+            self._mount = T_base_cam
+        else:
+            self._mount = np.eye(4) if T_base_cam is None else _rigid("T_base_cam", T_base_cam)
         self._guessed_stamps_ns: set[int] = set()
         self._mount_low = np.full(3, np.inf)
         self._mount_high = np.full(3, -np.inf)
         self._T_world_cam_first = np.eye(4)
-        self._T_base_cam: FloatArray | None = None
-        if callable(T_base_cam):
-            self._mount = T_base_cam
-        else:
-            T = np.eye(4) if T_base_cam is None else _rigid("T_base_cam", T_base_cam)
-            self._T_base_cam = T
-            self._mount = lambda _: (T, False)
-
-    @classmethod
-    def from_tf(
-        cls,
-        buffer: TfBuffer,
-        frame: str,
-        camera_frame: str,
-        *,
-        T_initial: FloatArray | None = None,
-        where: str = "the recording",
-    ) -> BaseFrame:
-        """Take from `/tf` where the camera is mounted on a frame.
-
-        Parameters
-        ----------
-        buffer : TfBuffer
-            Of the recording.
-        frame : str
-            Its name.
-        camera_frame : str
-            The frame_id of the images.
-        T_initial : ndarray of float64, shape (4, 4), optional
-            T_world_base of the first frame, metres; the identity where omitted.
-        where : str
-            The recording, for messages.
-
-        Raises
-        ------
-        RecordingError
-            When `/tf` does not connect the frames.
-        """
-        frame, camera_frame = bare(frame), bare(camera_frame)
-        if frame == camera_frame:
-            return cls(frame, T_initial=T_initial)
-        if not camera_frame:
-            raise RecordingError(
-                f"{where}: --frame {frame}: the images name no camera frame (their frame_id is "
-                "empty); give T_body_cam by --calibration FILE"
-            )
-        if buffer.is_static(frame, camera_frame):
-            T_base_cam = buffer.lookup(frame, camera_frame, 0)
-            if isinstance(T_base_cam, Failure):
-                raise _not_found(where, frame, camera_frame, buffer, T_base_cam.reason)
-            return cls(frame, T_base_cam, T_initial=T_initial)
-        return cls(frame, _MovingMount(buffer, frame, camera_frame, where), T_initial=T_initial)
 
     @property
     def is_placed(self) -> bool:
@@ -136,7 +93,7 @@ class BaseFrame:
     @property
     def fixed_mount(self) -> FloatArray | None:
         """T_base_cam, shape (4, 4), metres; None for the camera, and where it moves."""
-        return None if self.is_camera else self._T_base_cam
+        return None if self.is_camera or callable(self._mount) else self._mount
 
     @property
     def n_guessed(self) -> int:
@@ -150,10 +107,8 @@ class BaseFrame:
 
     def restarted(self) -> BaseFrame:
         """Return the same frame before a first frame."""
-        mount = self._mount if self._T_base_cam is None else self._T_base_cam
-        again = BaseFrame(self.name, None if self.is_camera else mount, T_initial=self.T_initial)
-        again.origin = self.origin
-        return again
+        mount = None if self.is_camera else self._mount
+        return BaseFrame(self.name, mount, T_initial=self.T_initial, origin=self.origin)
 
     def start(self, stamp_ns: int, T_initial: FloatArray | None = None) -> None:
         """Say which frame is the first one.
@@ -181,25 +136,23 @@ class BaseFrame:
 
     def T_base_cam(self, stamp_ns: int) -> FloatArray:  # noqa: N802 - the field's name
         """Return where the camera is mounted at a stamp, shape (4, 4), metres."""
-        T, is_guessed = self._mount(stamp_ns)
+        T, is_guessed = self._mount_at(stamp_ns)
         self._mount_low = np.minimum(self._mount_low, T[:3, 3])
         self._mount_high = np.maximum(self._mount_high, T[:3, 3])
         if is_guessed:
             self._guessed_stamps_ns.add(stamp_ns)
         return T
 
+    def _mount_at(self, stamp_ns: int) -> tuple[FloatArray, bool]:
+        return self._mount(stamp_ns) if callable(self._mount) else (self._mount, False)
+
     def apply(self, estimate: Estimate) -> Estimate:
-        """Return the estimate of the base frame.
+        """Return the estimate of the base frame; the same object where there is nothing to do.
 
         Parameters
         ----------
         estimate : Estimate
             Of the camera, in the world of the first camera: raw, causal or smoothed.
-
-        Returns
-        -------
-        Estimate
-            The very same object where there is nothing to do.
         """
         if self.first_stamp_ns is None:
             self.start(estimate.stamp_ns)
@@ -244,15 +197,7 @@ class BaseFrame:
         return replace(loop, T_reference_frame=edge.T_reference_frame, covariance=edge.covariance)
 
     def convert(self, trajectory: Trajectory) -> Trajectory:
-        """Convert a trajectory of the camera into that of the base frame.
-
-        Its world stays as it is: for comparing true poses of the camera with estimates of the
-        frame.
-
-        Parameters
-        ----------
-        trajectory : Trajectory
-            Of the camera, in any world.
+        """Convert true poses of the camera, in any world, into those of the base frame.
 
         Returns
         -------
@@ -272,9 +217,9 @@ class BaseFrame:
                 "positions of the camera without rotations tell no positions of "
                 f"{self.name or 'another frame'}; run without --frame to compare them"
             )
-        if self._T_base_cam is not None:
-            return trajectory.transformed(se3.invert(self._T_base_cam))
-        found = [self._mount(int(stamp_ns)) for stamp_ns in trajectory.stamps_ns]
+        if self.fixed_mount is not None:
+            return trajectory.transformed(se3.invert(self.fixed_mount))
+        found = [self._mount_at(int(stamp_ns)) for stamp_ns in trajectory.stamps_ns]
         is_known = np.array([not is_guessed for _, is_guessed in found], dtype=np.bool_)
         T_base_cam = np.array([T for T, _ in found]).reshape(-1, 4, 4)[is_known]
         known = trajectory.select(is_known)
@@ -282,31 +227,83 @@ class BaseFrame:
         return replace(known, T_world_frame=T_world_frame, covariances=None)
 
 
-class _MovingMount:
-    """Looks up where a camera that moves on the base frame is mounted."""
+def find_base_frame(
+    source: Source, name: str | None = None, *, T_initial: FloatArray | None = None
+) -> BaseFrame:
+    """Find a base frame by its name, and where the camera is mounted on it.
 
-    def __init__(self, buffer: TfBuffer, frame: str, camera_frame: str, where: str) -> None:
-        self._buffer, self._frame, self._camera_frame = buffer, frame, camera_frame
-        stamps_ns = buffer.edge_stamps_ns(frame, camera_frame)
-        _, is_known = buffer.lookup_many(frame, camera_frame, stamps_ns)
-        self._known_stamps_ns: IntArray = stamps_ns[is_known]
-        if len(self._known_stamps_ns) == 0:
-            answer = buffer.lookup(frame, camera_frame, int(stamps_ns[0]) if len(stamps_ns) else 0)
-            reason = answer.reason if isinstance(answer, Failure) else "no transform at any stamp"
-            raise _not_found(where, frame, camera_frame, buffer, reason)
+    Parameters
+    ----------
+    source : Source
+        The recording.
+    name : str, optional
+        As `/tf` of a bag names it; where that does not connect it with the camera, it is the
+        body that the calibration places the camera on. Omitted: the camera itself.
+    T_initial : ndarray of float64, shape (4, 4), optional
+        T_world_frame of the first frame, metres; the identity where omitted.
 
-    def __call__(self, stamp_ns: int) -> tuple[FloatArray, bool]:
-        T = self._buffer.lookup(self._frame, self._camera_frame, stamp_ns)
+    Raises
+    ------
+    RecordingError
+        When neither says where the camera is.
+    """
+    info = source.info
+    if name is None:
+        return BaseFrame(info.frame_id, T_initial=T_initial)
+    name = name.strip("/")
+    if isinstance(source, BagSource):
+        buffer = source.transforms((name, info.frame_id))
+        if info.T_body_cam is None or name in buffer.frames:
+            mount = mount_by_tf(buffer, name, bare(info.frame_id), info.name)
+            return BaseFrame(name, mount, T_initial=T_initial)
+    if info.T_body_cam is None:
+        raise RecordingError(
+            f"{info.name}: --frame {name}: the recording does not say where the camera is on it; "
+            "give a calibration with the camera's pose on the body by --calibration FILE"
+        )
+    origin = "the body on which the calibration places the camera"
+    return BaseFrame(name, info.T_body_cam, T_initial=T_initial, origin=origin)
+
+
+def mount_by_tf(
+    buffer: TfBuffer, frame: str, camera_frame: str, where: str
+) -> FloatArray | Mount | None:
+    """Return T_frame_camera, over time where it moves; None where both are one frame."""
+    if frame == camera_frame:
+        return None
+    if not camera_frame:
+        raise RecordingError(
+            f"{where}: --frame {frame}: the images name no camera frame (their frame_id is "
+            "empty); give T_body_cam by --calibration FILE"
+        )
+    stamps_ns = buffer.edge_stamps_ns(frame, camera_frame)
+    _, is_known = buffer.lookup_many(frame, camera_frame, stamps_ns)
+    if np.any(is_known):
+        return _moving_mount(buffer, frame, camera_frame, stamps_ns[is_known])
+    T = buffer.lookup(frame, camera_frame, int(stamps_ns[0]) if len(stamps_ns) else 0)
+    if not isinstance(T, Failure):
+        return T
+    is_named = {frame, camera_frame} <= set(buffer.frames)
+    held = f"; tf holds {list_names(buffer.frames)}" if is_named else ""
+    raise RecordingError(
+        f"{where}: --frame {frame}: no transform from the camera frame {camera_frame}: "
+        f"{T.reason}{held}; give another --frame, or T_body_cam by --calibration FILE"
+    )
+
+
+def _moving_mount(
+    buffer: TfBuffer, frame: str, camera_frame: str, known_stamps_ns: IntArray
+) -> Mount:
+    def mount(stamp_ns: int) -> tuple[FloatArray, bool]:
+        T = buffer.lookup(frame, camera_frame, stamp_ns)
         if not isinstance(T, Failure):
             return T, False
-        known_ns = self._known_stamps_ns
-        after = int(np.searchsorted(known_ns, stamp_ns))
-        beside = known_ns[max(after - 1, 0) : after + 1]
-        nearest_ns = int(beside[np.argmin(np.abs(beside - stamp_ns))])
-        T = self._buffer.lookup(self._frame, self._camera_frame, nearest_ns)
-        if isinstance(T, Failure):  # known when this was made; the buffer was changed since
-            raise ValueError(f"the buffer was changed after it was given away: {T.reason}")
-        return T, True
+        after = int(np.searchsorted(known_stamps_ns, stamp_ns))
+        beside = known_stamps_ns[max(after - 1, 0) : after + 1]
+        nearest_ns = beside[np.argmin(np.abs(beside - stamp_ns))]
+        return buffer.lookup_many(frame, camera_frame, np.array([nearest_ns]))[0][0], True
+
+    return mount
 
 
 def parse_initial_pose(text: str) -> InitialPose:
@@ -359,14 +356,3 @@ def _rigid(name: str, T: FloatArray) -> FloatArray:
     if fault:
         raise ValueError(f"{name} {fault}")
     return se3.normalize(T)
-
-
-def _not_found(
-    where: str, frame: str, camera_frame: str, buffer: TfBuffer, reason: str
-) -> RecordingError:
-    is_named = {frame, camera_frame} <= set(buffer.frames)
-    held = f"; tf holds {list_names(buffer.frames)}" if is_named else ""
-    return RecordingError(
-        f"{where}: --frame {frame}: no transform from the camera frame {camera_frame}: "
-        f"{reason}{held}; give another --frame, or T_body_cam by --calibration FILE"
-    )

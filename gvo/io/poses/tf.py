@@ -4,151 +4,30 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gvo.errors import RecordingError
 from gvo.geometry import se3
-from gvo.io.bag.messages import stamp_of
+from gvo.io.bag.messages import bare, stamp_of
 from gvo.io.bag.reader import OLD_TF_TYPE, TF_TYPE, MessageReader
-from gvo.io.poses.tf_paths import (
-    FramePath,
-    ancestors,
-    bare,
-    describe_unknown,
-    find_path,
-    list_names,
-)
 from gvo.trajectory.formats import MAX_POSITION_M
 from gvo.trajectory.trajectory import format_stamp
 from gvo.types import BoolArray, Failure, FloatArray, IntArray
 
+TF_TYPES = (TF_TYPE, OLD_TF_TYPE)
+"""Message types that hold transforms between named frames."""
+
 _N_NUMBERS = 7
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Samples:
-    """Transforms of one child frame, sorted by stamp.
-
-    Parameters
-    ----------
-    stamps_ns : ndarray of int64, shape (n,)
-        Strictly increasing, nanoseconds.
-    poses : ndarray of float64, shape (n, 7)
-        Translation, metres, and quaternion (x, y, z, w) of T_parent_child.
-    parents : ndarray of int64, shape (n,)
-        Numbers of the parent frames.
-    changes_parent : bool
-        Whether the child hangs on more than one parent over time.
-    """
-
-    stamps_ns: IntArray
-    poses: FloatArray
-    parents: IntArray
-    changes_parent: bool
-
-    def parents_at(self, stamps_ns: IntArray) -> IntArray:
-        """Return the parents at stamps (m,); outside of the known range the nearest known."""
-        return self.parents[np.maximum(self._before(stamps_ns), 0)]
-
-    def at(self, stamps_ns: IntArray) -> tuple[FloatArray, BoolArray]:
-        """Interpolate between the neighbours, linearly and along the shortest arc.
-
-        Parameters
-        ----------
-        stamps_ns : ndarray of int64, shape (m,)
-            In any order, nanoseconds.
-
-        Returns
-        -------
-        T_parent_child : ndarray of float64, shape (m, 4, 4)
-            Outside of the known range, the transform at its end. Between samples of two parents,
-            the earlier sample, as tf2 does.
-        is_known : ndarray of bool, shape (m,)
-            Which stamps lie in the known range.
-        """
-        before = self._before(stamps_ns)
-        is_known = (before >= 0) & (stamps_ns <= self.stamps_ns[-1])
-        before = np.maximum(before, 0)
-        after = np.minimum(before + 1, len(self.stamps_ns) - 1)
-        after = np.where(self.parents[after] == self.parents[before], after, before)
-        spans_ns = np.maximum(self.stamps_ns[after] - self.stamps_ns[before], 1)
-        elapsed_ns = np.where(is_known, stamps_ns - self.stamps_ns[before], 0)
-        shares = np.where(after > before, elapsed_ns / spans_ns, 0.0)[:, np.newaxis]
-        return _between(self.poses[before], self.poses[after], shares), is_known
-
-    def _before(self, stamps_ns: IntArray) -> IntArray:
-        """Return the index of the last sample up to each stamp, -1 where there is none."""
-        return np.asarray(np.searchsorted(self.stamps_ns, stamps_ns, side="right") - 1)
-
-
-class SampleLog:
-    """Collects the transforms of one child frame in any order."""
-
-    def __init__(self) -> None:
-        self._sorted = _sorted(
-            np.empty(0, dtype=np.int64), np.empty((0, _N_NUMBERS)), np.empty(0, dtype=np.int32)
-        )
-        self._clear_tail()
-
-    def _clear_tail(self) -> None:
-        self._stamps_ns, self._poses, self._parents = array("q"), array("d"), array("i")
-
-    def __len__(self) -> int:
-        """Return the number of transforms, the repeated ones of the last lookup left out."""
-        return len(self._sorted.stamps_ns) + len(self._stamps_ns)
-
-    def append(self, stamp_ns: int, numbers: tuple[float, ...], parent: int) -> None:
-        """Add a transform: translation and quaternion (x, y, z, w), seven numbers."""
-        self._stamps_ns.append(stamp_ns)
-        self._poses.extend(numbers)
-        self._parents.append(parent)
-
-    def samples(self) -> Samples:
-        """Return all transforms by stamp; of those with one stamp the last that was added."""
-        if self._stamps_ns:
-            self._sorted = _sorted(
-                np.concatenate([self._sorted.stamps_ns, np.frombuffer(self._stamps_ns, np.int64)]),
-                np.concatenate(
-                    [self._sorted.poses, np.frombuffer(self._poses).reshape(-1, _N_NUMBERS)]
-                ),
-                np.concatenate([self._sorted.parents, np.frombuffer(self._parents, np.int32)]),
-            )
-            self._clear_tail()
-        return self._sorted
-
-
-def _sorted(stamps_ns: IntArray, poses: FloatArray, parents: IntArray) -> Samples:
-    steps = np.diff(stamps_ns)
-    if not np.all(steps > 0):
-        order = np.argsort(stamps_ns, kind="stable")
-        is_last = np.append(np.diff(stamps_ns[order]) > 0, True)
-        kept = order[is_last]
-        stamps_ns, poses, parents = stamps_ns[kept], poses[kept], parents[kept]
-    return Samples(
-        stamps_ns=stamps_ns,
-        poses=poses,
-        parents=parents,
-        # Told here: each lookup asks for it.
-        changes_parent=bool(np.any(parents[1:] != parents[:-1])),
-    )
-
-
-def _between(start: FloatArray, end: FloatArray, shares: FloatArray) -> FloatArray:
-    """Interpolate between poses (n, 7) at shares (n, 1); return transforms (n, 4, 4)."""
-    if len(shares) == 0:
-        return np.empty((0, 4, 4))
-    rotations = Rotation.from_quat(start[:, 3:])
-    arcs = (rotations.inv() * Rotation.from_quat(end[:, 3:])).as_rotvec()
-    R = (rotations * Rotation.from_rotvec(shares * arcs)).as_matrix()
-    return se3.make_transform(np.asarray(R), start[:, :3] + shares * (end[:, :3] - start[:, :3]))
-
-
 _SQUARED_NORM_TOLERANCE = 1e-2  # of quaternions, as in tf2
+# About 14 MB: up to here all transforms are kept, beyond it what was asked for.
+_N_KEPT_WHOLE = 200_000
+_N_LISTED = 12
 
 
 class TfBuffer:
@@ -164,21 +43,23 @@ class TfBuffer:
         Invalid transforms, which were left out.
     first_refused : str
         The first of them in one line; empty if none.
+    edges : set of (str, str)
+        All pairs (parent, child) that ever were added.
     """
 
     def __init__(self) -> None:
+        self.edges: set[tuple[str, str]] = set()
+        self.n_refused = 0
+        self.first_refused = ""
         self._numbers: dict[str, int] = {}
         self._names: list[str] = []
-        self._edges: set[tuple[str, str]] = set()
-        self._moving: dict[str, SampleLog] = {}
+        self._moving: dict[str, _Log] = {}
         self._static: dict[str, tuple[str, FloatArray]] = {}
         self._n_moving = 0
         self._kept: Collection[str] | None = None
-        self.n_refused = 0
-        self.first_refused = ""
 
     def __len__(self) -> int:
-        """Return the number of transforms held, repeated ones included."""
+        """Return the number of transforms held."""
         return self._n_moving + len(self._static)
 
     @property
@@ -190,11 +71,6 @@ class TfBuffer:
     def frames(self) -> tuple[str, ...]:
         """Names of all frames, sorted, without leading slashes."""
         return tuple(sorted(self._names))
-
-    @property
-    def edges(self) -> frozenset[tuple[str, str]]:
-        """All pairs (parent, child) that ever were added."""
-        return frozenset(self._edges)
 
     @property
     def notes(self) -> list[str]:
@@ -209,7 +85,7 @@ class TfBuffer:
             notes.append(
                 f"tf: {list_names(both)} published as static and as moving; the moving edge is used"
             )
-        changing = sorted(self._changing(self._moving))
+        changing = self._changing(self._moving)
         if changing:
             notes.append(f"tf: the parent of {list_names(changing)} changes over time")
         return notes
@@ -232,7 +108,7 @@ class TfBuffer:
         if reason:
             self.refuse(f"{parent} -> {child} at {format_stamp(stamp_ns)} s: {reason}")
             return
-        self._edges.add((parent, child))
+        self.edges.add((parent, child))
         number, _ = self._number(parent), self._number(child)
         if self._kept is not None and child not in self._kept:
             return
@@ -240,7 +116,7 @@ class TfBuffer:
             R = np.asarray(Rotation.from_quat(pose[3:]).as_matrix())
             self._static[child] = (parent, se3.make_transform(R, np.array(pose[:3])))
         else:
-            self._moving.setdefault(child, SampleLog()).append(stamp_ns, pose, number)
+            self._moving.setdefault(child, _Log()).append(stamp_ns, pose, number)
             self._n_moving += 1
 
     def refuse(self, reason: str) -> None:
@@ -256,7 +132,7 @@ class TfBuffer:
         self._kept = children
         self._moving = {name: log for name, log in self._moving.items() if name in children}
         self._static = {name: edge for name, edge in self._static.items() if name in children}
-        self._n_moving = sum(map(len, self._moving.values()))
+        self._n_moving = sum(len(log.stamps_ns) for log in self._moving.values())
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> FloatArray | Failure:
         """Return T_target_source at a stamp: p_target = T_target_source @ p_source.
@@ -317,14 +193,9 @@ class TfBuffer:
         Where a parent changes over time, this is the chain at the end.
         """
         path = self._paths_over_time(bare(target), bare(source))[-1]
-        return path if isinstance(path, Failure) else path.names
-
-    def is_static(self, target: str, source: str) -> bool:
-        """Tell whether two frames are connected by static edges alone."""
-        return all(
-            isinstance(path, FramePath) and self._moving.keys().isdisjoint(path.children)
-            for path in self._paths_over_time(bare(target), bare(source))
-        )
+        if isinstance(path, Failure):
+            return path
+        return (*path.from_target, path.ancestor, *reversed(path.from_source))
 
     def edge_stamps_ns(self, target: str, source: str) -> IntArray:
         """Return the stamps of all transforms of the moving edges between two frames.
@@ -335,8 +206,8 @@ class TfBuffer:
             Increasing; empty where no moving edge lies between, or no path at all.
         """
         paths = self._paths_over_time(bare(target), bare(source))
-        children = {c for path in paths if isinstance(path, FramePath) for c in path.children}
-        return self._stamps_ns(children)
+        found = (path for path in paths if isinstance(path, _Path))
+        return self._stamps_ns({child for path in found for child in path.children})
 
     def _number(self, name: str) -> int:
         number = self._numbers.setdefault(name, len(self._names))
@@ -345,7 +216,6 @@ class TfBuffer:
         return number
 
     def _stamps_ns(self, children: Collection[str]) -> IntArray:
-        """Return the stamps of all transforms of those children that move."""
         moving = self._moving.keys() & children
         stamps = [self._moving[child].samples().stamps_ns for child in sorted(moving)]
         return np.unique(np.concatenate([np.empty(0, dtype=np.int64), *stamps]))
@@ -355,44 +225,33 @@ class TfBuffer:
         moving = self._moving.keys() & children
         return sorted(child for child in moving if self._moving[child].samples().changes_parent)
 
-    def _trees(
-        self, frames: tuple[str, ...], stamps_ns: IntArray
-    ) -> Iterator[tuple[dict[str, str], IntArray]]:
-        """Yield the parent of each child above some frames, and at which of the stamps."""
-        above = ancestors(self._edges, frames)
+    def _paths(
+        self, target: str, source: str, stamps_ns: IntArray
+    ) -> Iterator[tuple[_Path | Failure, IntArray]]:
+        """Yield the paths between two frames, each with the rows of stamps at which it holds."""
+        above = _ancestors(self.edges, (target, source))
         parents = {c: parent for c, (parent, _) in self._static.items() if c in above}
         for child in self._moving.keys() & above:
             parents[child] = self._names[self._moving[child].samples().parents[-1]]
         changing = self._changing(above)
         if not changing or len(stamps_ns) == 0:
-            yield parents, np.arange(len(stamps_ns))
+            yield _find_path(parents, target, source), np.arange(len(stamps_ns))
             return
         numbers = [self._moving[child].samples().parents_at(stamps_ns) for child in changing]
         alternatives, kinds = np.unique(np.stack(numbers), axis=1, return_inverse=True)
         kinds = kinds.reshape(-1)  # some releases of numpy return a row
         for kind, alternative in enumerate(alternatives.T):
             changed = {c: self._names[n] for c, n in zip(changing, alternative, strict=True)}
-            yield parents | changed, np.flatnonzero(kinds == kind)
+            yield _find_path(parents | changed, target, source), np.flatnonzero(kinds == kind)
 
-    def _paths(
-        self, target: str, source: str, stamps_ns: IntArray
-    ) -> Iterator[tuple[FramePath | Failure, IntArray]]:
-        """Yield the paths between two frames, each with the stamps at which it exists."""
-        for parents, rows in self._trees((target, source), stamps_ns):
-            yield find_path(parents, target, source), rows
-
-    def _paths_over_time(self, target: str, source: str) -> list[FramePath | Failure]:
+    def _paths_over_time(self, target: str, source: str) -> list[_Path | Failure]:
         """Return all paths between two frames over time, the newest last."""
-        changing = self._changing(ancestors(self._edges, (target, source)))
-        stamps_ns = self._stamps_ns(changing)
-        paths = list(self._paths(target, source, stamps_ns))
+        changing = self._changing(_ancestors(self.edges, (target, source)))
+        paths = list(self._paths(target, source, self._stamps_ns(changing)))
         return [path for path, _ in sorted(paths, key=lambda found: found[1].max(initial=-1))]
 
-    def _climb(self, children: Sequence[str], stamps_ns: IntArray) -> tuple[FloatArray, BoolArray]:
-        """Return T_ancestor_frame, shape (n, 4, 4), and where it is known.
-
-        The children are those of the edges from the frame upwards.
-        """
+    def _climb(self, children: Iterable[str], stamps_ns: IntArray) -> tuple[FloatArray, BoolArray]:
+        """Return T_ancestor_frame, shape (n, 4, 4), over edges from the frame upwards."""
         T = np.tile(np.eye(4), (len(stamps_ns), 1, 1))
         is_known = np.ones(len(stamps_ns), dtype=np.bool_)
         for child in children:
@@ -406,7 +265,7 @@ class TfBuffer:
     def _why_unknown(self, target: str, source: str, stamp_ns: int) -> Failure:
         for name in (target, source):
             if name not in self._numbers:
-                return Failure(reason=describe_unknown(name, self.frames))
+                return Failure(reason=_describe_unknown(name, self.frames))
         stamps_ns = np.array([stamp_ns], dtype=np.int64)
         ((path, _),) = self._paths(target, source, stamps_ns)
         if isinstance(path, Failure):
@@ -420,6 +279,76 @@ class TfBuffer:
             f"{format_stamp(first_ns)} to {format_stamp(last_ns)} s, "
             f"not at {format_stamp(stamp_ns)} s"
         )
+
+
+@dataclass(slots=True)
+class _Log:
+    """The transforms of one child frame, in the order in which they were added."""
+
+    stamps_ns: array[int] = field(default_factory=lambda: array("q"))
+    poses: array[float] = field(default_factory=lambda: array("d"))
+    parents: array[int] = field(default_factory=lambda: array("q"))
+    _sorted: _Samples | None = None
+
+    def append(self, stamp_ns: int, pose: tuple[float, ...], parent: int) -> None:
+        self.stamps_ns.append(stamp_ns)
+        self.poses.extend(pose)
+        self.parents.append(parent)
+        self._sorted = None
+
+    def samples(self) -> _Samples:
+        """Return all transforms by stamp; of those with one stamp the last that was added."""
+        if self._sorted is None:
+            stamps_ns = np.array(self.stamps_ns)
+            order = np.argsort(stamps_ns, kind="stable")
+            kept = order[np.append(np.diff(stamps_ns[order]) > 0, True)]
+            poses = np.array(self.poses).reshape(-1, _N_NUMBERS)
+            parents = np.array(self.parents)[kept]
+            changes_parent = bool(np.any(parents[1:] != parents[:-1]))
+            self._sorted = _Samples(stamps_ns[kept], poses[kept], parents, changes_parent)
+        return self._sorted
+
+
+class _Samples(NamedTuple):
+    """Transforms T_parent_child of one child frame, strictly increasing by stamp."""
+
+    stamps_ns: IntArray
+    poses: FloatArray  # (n, 7): translation, metres, and quaternion (x, y, z, w)
+    parents: IntArray  # numbers of the frames
+    changes_parent: bool
+
+    def parents_at(self, stamps_ns: IntArray) -> IntArray:
+        """Return the parents at stamps (m,); outside of the known range the nearest known."""
+        return self.parents[np.maximum(self._before(stamps_ns), 0)]
+
+    def at(self, stamps_ns: IntArray) -> tuple[FloatArray, BoolArray]:
+        """Interpolate linearly and along the shortest arc: transforms (m, 4, 4), and where known.
+
+        Between samples of two parents it is the earlier sample, as in tf2.
+        """
+        before = self._before(stamps_ns)
+        is_known = (before >= 0) & (stamps_ns <= self.stamps_ns[-1])
+        before = np.maximum(before, 0)
+        after = np.minimum(before + 1, len(self.stamps_ns) - 1)
+        after = np.where(self.parents[after] == self.parents[before], after, before)
+        spans_ns = np.maximum(self.stamps_ns[after] - self.stamps_ns[before], 1)
+        elapsed_ns = np.where(is_known, stamps_ns - self.stamps_ns[before], 0)
+        shares = np.where(after > before, elapsed_ns / spans_ns, 0.0)[:, np.newaxis]
+        return _between(self.poses[before], self.poses[after], shares), is_known
+
+    def _before(self, stamps_ns: IntArray) -> IntArray:
+        """Return the index of the last sample up to each stamp, -1 where there is none."""
+        return np.asarray(np.searchsorted(self.stamps_ns, stamps_ns, side="right") - 1)
+
+
+def _between(start: FloatArray, end: FloatArray, shares: FloatArray) -> FloatArray:
+    """Interpolate between poses (n, 7) at shares (n, 1); return transforms (n, 4, 4)."""
+    if len(shares) == 0:
+        return np.empty((0, 4, 4))
+    rotations = Rotation.from_quat(start[:, 3:])
+    arcs = (rotations.inv() * Rotation.from_quat(end[:, 3:])).as_rotvec()
+    R = (rotations * Rotation.from_rotvec(shares * arcs)).as_matrix()
+    return se3.make_transform(np.asarray(R), start[:, :3] + shares * (end[:, :3] - start[:, :3]))
 
 
 def _fault(parent: str, child: str, pose: tuple[float, ...]) -> str:
@@ -438,11 +367,69 @@ def _fault(parent: str, child: str, pose: tuple[float, ...]) -> str:
     return ""
 
 
-TF_TYPES = (TF_TYPE, OLD_TF_TYPE)
-"""Message types that hold transforms between named frames."""
+class _Path(NamedTuple):
+    """The edges between two frames, each named by its child, up to where both ways meet."""
 
-# About 14 MB: up to here all transforms are kept, beyond it what was asked for.
-_N_KEPT_WHOLE = 200_000
+    from_target: tuple[str, ...]
+    from_source: tuple[str, ...]
+    ancestor: str
+
+    @property
+    def children(self) -> tuple[str, ...]:
+        return self.from_target + self.from_source
+
+
+def _find_path(parents: Mapping[str, str], target: str, source: str) -> _Path | Failure:
+    """Find the path by the lowest common ancestor, or name the roots of both trees, or a loop."""
+    above_target, above_source = _upwards(parents, target), _upwards(parents, source)
+    for way in (above_target, above_source):
+        if way[-1] in parents:
+            loop = [*way[way.index(parents[way[-1]]) :], parents[way[-1]]]
+            return Failure(reason=f"tf holds a loop: {' <- '.join(loop)}")
+    ranks = {name: rank for rank, name in enumerate(above_source)}
+    for rank, name in enumerate(above_target):
+        if name in ranks:
+            return _Path(tuple(above_target[:rank]), tuple(above_source[: ranks[name]]), name)
+    return Failure(
+        reason=f"tf does not connect {target} and {source}: the tree of {target} ends at "
+        f"{above_target[-1]}, that of {source} at {above_source[-1]}"
+    )
+
+
+def _upwards(parents: Mapping[str, str], frame: str) -> list[str]:
+    """Return a frame and its ancestors, up to the root or to where a loop closes."""
+    way = {frame: None}  # keeps the order, and tells quickly what it holds
+    while (parent := parents.get(frame)) is not None and parent not in way:
+        way[parent] = None
+        frame = parent
+    return list(way)
+
+
+def _ancestors(edges: Iterable[tuple[str, str]], frames: Iterable[str]) -> set[str]:
+    """Return frames and all their ancestors by any of the edges (parent, child)."""
+    parents: dict[str, set[str]] = {}
+    for parent, child in edges:
+        parents.setdefault(child, set()).add(parent)
+    found: set[str] = set()
+    ahead = set(frames)
+    while ahead:
+        found |= ahead
+        ahead = {parent for child in ahead for parent in parents.get(child, ())} - found
+    return found
+
+
+def _describe_unknown(name: str, frames: tuple[str, ...]) -> str:
+    if not frames:
+        return f"tf holds no frame {name}: it is empty"
+    close = get_close_matches(name, frames, n=3, cutoff=0.5)
+    nearest = f" (the nearest: {', '.join(close)})" if close else ""
+    return f"tf holds no frame {name}{nearest}; it holds {list_names(frames)}"
+
+
+def list_names(names: Collection[str]) -> str:
+    """Return the first names in one line, and how many more there are."""
+    n_more = len(names) - _N_LISTED
+    return ", ".join(list(names)[:_N_LISTED]) + (f" and {n_more} more" if n_more > 0 else "")
 
 
 def read_tf(reader: MessageReader, *, frames: Collection[str] | None = None) -> TfBuffer:
@@ -485,7 +472,7 @@ def read_tf(reader: MessageReader, *, frames: Collection[str] | None = None) -> 
 
 
 def _above(buffer: TfBuffer, frames: Collection[str]) -> set[str]:
-    return ancestors(buffer.edges, map(bare, frames))
+    return _ancestors(buffer.edges, map(bare, frames))
 
 
 def _transforms(reader: MessageReader, buffer: TfBuffer) -> Iterator[tuple[Any, bool]]:

@@ -9,8 +9,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from gvo.geometry import se3
+from gvo.io.bag.messages import bare
 from gvo.io.convert.bag_messages import FramePose
-from gvo.io.poses.tf_paths import bare
 from gvo.types import Estimate, FloatArray
 from gvo.viz.scene import ESTIMATES, GLOBAL, StampedPose
 

@@ -12,11 +12,10 @@ from gvo.config import Config
 from gvo.errors import CalibrationError, RecordingError
 from gvo.io.bag.cameras import find_contradiction
 from gvo.io.bag.recovery.scan import Channel
-from gvo.io.bag.source import BagSource
+from gvo.io.bag.source import BagSource, describe_camera_changes
 from gvo.io.bag.topics import IMAGE_TYPE, TopicChoice
 from gvo.io.frames import frames
 from gvo.io.opening import open_recording
-from gvo.io.poses.inputs import describe_camera_changes
 from gvo.types import FaultyFrame, RgbdFrame, StereoFrame
 from tests.make.bags import Message, camera_info, image, write
 

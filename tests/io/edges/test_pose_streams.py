@@ -18,7 +18,10 @@ from gvo.io.edges.pose_streams import (
     TrajectoryStream,
     step_covariance,
 )
-from gvo.trajectory.formats import write_covariances, write_kitti, write_tum
+from gvo.trajectory.formats import (
+    write_kitti,
+    write_tum,
+)
 from gvo.trajectory.trajectory import StampsFrom, Trajectory
 from gvo.types import FloatArray, PosePrior
 
@@ -196,7 +199,8 @@ def test_covariances_beside_a_file_are_taken(tmp_path: Path) -> None:
         covariances=np.stack(covariances),
     )
     write_tum(tmp_path / "raw.txt", trajectory)
-    write_covariances(tmp_path / "raw_covariance.csv", trajectory)
+    rows = map(format_covariance_line, trajectory.stamps_ns.tolist(), covariances)
+    (tmp_path / "raw_covariance.csv").write_text("\n".join([COVARIANCE_HEADER, *rows, ""]))
     source = FusedChains([TrajectoryStream(path=tmp_path / "raw.txt")], [StepSigma()])
     events = [event for event in source.events() if isinstance(event, PoseEvent)]
     for event, C in zip(events[1:], steps, strict=True):

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from gvo.errors import ConfigurationError, RecordingError, TrajectoryError
 from gvo.geometry import se3
-from gvo.io.poses.base_frame import BaseFrame, parse_initial_pose
+from gvo.io.poses.base_frame import BaseFrame, mount_by_tf, parse_initial_pose
 from gvo.io.poses.tf import TfBuffer
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Edge, Estimate, FloatArray
@@ -44,6 +44,12 @@ def camera_drive(rng: np.random.Generator) -> list[Estimate]:
     ]
 
 
+def on_tf(
+    buffer: TfBuffer, frame: str, camera: str, T_initial: FloatArray | None = None
+) -> BaseFrame:
+    return BaseFrame(frame, mount_by_tf(buffer, frame, camera, "drive.bag"), T_initial=T_initial)
+
+
 def apply_all(frame: BaseFrame, estimates: Sequence[Estimate]) -> list[Estimate]:
     return [frame.apply(estimate) for estimate in estimates]
 
@@ -62,7 +68,7 @@ def mounted(rng: np.random.Generator, stamps_ns: Sequence[int]) -> tuple[TfBuffe
 
 def test_the_camera_itself_comes_back_untouched() -> None:
     drive = camera_drive(np.random.default_rng(0))
-    for frame in (BaseFrame(), BaseFrame.from_tf(TfBuffer(), "/cam", "cam")):
+    for frame in (BaseFrame(), on_tf(TfBuffer(), "cam", "cam")):
         assert all(out is given for out, given in zip(apply_all(frame, drive), drive, strict=True))
         assert frame.first_stamp_ns == STAMPS_NS[0]
 
@@ -99,7 +105,7 @@ def test_a_mount_that_moves_is_composed_as_by_hand_in_any_order(seed: int) -> No
     rng = np.random.default_rng(seed)
     drive = camera_drive(rng)
     buffer, T_base_cam = mounted(rng, STAMPS_NS)
-    frame = BaseFrame.from_tf(buffer, "base", "/cam")
+    frame = on_tf(buffer, "base", "cam")
     frame.start(STAMPS_NS[0])
     for n in rng.permutation(len(drive)):
         expected = T_base_cam[0] @ drive[n].T_world_frame @ np.linalg.inv(T_base_cam[n])
@@ -112,7 +118,7 @@ def test_a_mount_that_moves_is_composed_as_by_hand_in_any_order(seed: int) -> No
 def test_an_edge_leads_from_base_to_base(seed: int) -> None:
     rng = np.random.default_rng(seed)
     buffer, _ = mounted(rng, STAMPS_NS)
-    frame = BaseFrame.from_tf(buffer, "base", "cam")
+    frame = on_tf(buffer, "base", "cam")
     first, *_, last = camera_drive(rng)
     edge = Edge(
         reference_id=first.stamp_ns,
@@ -131,7 +137,7 @@ def test_an_edge_leads_from_base_to_base(seed: int) -> None:
 def test_a_base_that_stands_still_stands_still_under_a_camera_that_pans(seed: int) -> None:
     rng = np.random.default_rng(seed)
     buffer, T_base_cam = mounted(rng, STAMPS_NS)
-    frame = BaseFrame.from_tf(buffer, "base", "cam", T_initial=random_transform(rng))
+    frame = on_tf(buffer, "base", "cam", T_initial=random_transform(rng))
     outs = [
         frame.apply(estimate_at(stamp_ns, np.linalg.inv(T_base_cam[0]) @ T_base_cam[n]))
         for n, stamp_ns in enumerate(STAMPS_NS)
@@ -144,7 +150,7 @@ def test_a_base_that_stands_still_stands_still_under_a_camera_that_pans(seed: in
 def test_the_covariance_is_that_of_sampled_poses(is_moving: bool) -> None:
     rng = np.random.default_rng(3)
     buffer, T_base_cam = mounted(rng, STAMPS_NS)
-    mount = BaseFrame.from_tf(buffer, "base", "cam")
+    mount = on_tf(buffer, "base", "cam")
     frame = mount if is_moving else BaseFrame("base", T_base_cam[0])
     frame.start(STAMPS_NS[0])
     T, covariance = random_transform(rng), random_covariance(rng, scale=1e-4)
@@ -167,7 +173,7 @@ def test_where_tf_starts_late_and_ends_early_the_nearest_transform_is_taken_and_
     rng = np.random.default_rng(1)
     drive = camera_drive(rng)
     buffer, T_base_cam = mounted(rng, STAMPS_NS[2:5])
-    frame = BaseFrame.from_tf(buffer, "base", "cam")
+    frame = on_tf(buffer, "base", "cam")
     for _ in range(2):  # raw and causal, say
         outs = apply_all(frame, drive)
     rows = [0, 0, 0, 1, 2, 2]
@@ -183,7 +189,7 @@ def test_while_the_camera_is_off_its_mount_the_transform_nearest_in_time_is_take
         at = np.array([float(stamp_ns), 0.0, 0.0])
         add_transform(buffer, "base", "cam", stamp_ns, se3.make_transform(np.eye(3), at))
     add_transform(buffer, "shelf", "cam", 30, np.eye(4))
-    frame = BaseFrame.from_tf(buffer, "base", "cam")
+    frame = on_tf(buffer, "base", "cam")
     xs = [float(frame.T_base_cam(stamp_ns)[0, 3]) for stamp_ns in (15, 25, 32, 50, 65)]
     np.testing.assert_allclose(xs, [15.0, 20.0, 20.0, 60.0, 65.0])
     assert frame.n_guessed == 2
@@ -221,7 +227,7 @@ def test_frames_that_tf_does_not_connect_are_refused_in_one_line(
     add_transform(buffer, "base_link", "rider", 1, np.eye(4))
     add_transform(buffer, "rider", "late", 2, np.eye(4))
     with pytest.raises(RecordingError) as caught:
-        BaseFrame.from_tf(buffer, frame, camera, where="drive.bag")
+        on_tf(buffer, frame, camera)
     text = str(caught.value)
     assert "\n" not in text
     for word in ("drive.bag", f"--frame {frame}", "--calibration", camera, *words):
@@ -230,7 +236,7 @@ def test_frames_that_tf_does_not_connect_are_refused_in_one_line(
 
 def test_without_any_tf_the_line_says_so() -> None:
     with pytest.raises(RecordingError, match="tf holds no frame base: it is empty"):
-        BaseFrame.from_tf(TfBuffer(), "base", "cam")
+        on_tf(TfBuffer(), "base", "cam")
 
 
 def test_what_is_no_rigid_transform_is_refused() -> None:
@@ -247,7 +253,7 @@ def test_true_poses_of_the_camera_become_those_of_the_frame_in_its_world(is_movi
     drive = camera_drive(rng)
     buffer, T_base_cam = mounted(rng, STAMPS_NS[1:])
     static = BaseFrame("base", T_base_cam[0], T_initial=random_transform(rng))
-    frame = BaseFrame.from_tf(buffer, "base", "cam") if is_moving else static
+    frame = on_tf(buffer, "base", "cam") if is_moving else static
     truth = frame.convert(Trajectory.of(drive))
     first = 1 if is_moving else 0  # tf says nothing of the first stamp
     assert truth.stamps_ns.tolist() == STAMPS_NS[first:]
@@ -292,7 +298,7 @@ def test_a_correction_of_the_camera_is_that_of_the_base_frame(seed: int) -> None
     rng = np.random.default_rng(seed)
     drive = camera_drive(rng)
     buffer, _ = mounted(rng, STAMPS_NS)
-    frame = BaseFrame.from_tf(buffer, "base", "cam")
+    frame = on_tf(buffer, "base", "cam")
     frame.start(STAMPS_NS[0], random_transform(rng))
     T_map_world = random_transform(rng)
     for estimate in drive:

@@ -11,19 +11,16 @@ from scipy.spatial.transform import Rotation, Slerp
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
 from gvo.io.bag.reader import BagReader
-from gvo.io.poses.ground_truth import (
+from gvo.io.poses.truth import (
     TRUTH_FRAMES,
-    BagTruth,
     BagTruthSpec,
+    Poses,
     TfTruth,
-    TopicTruth,
     find_named_truth,
-    is_named_truth,
     parse_bag_truth,
     parse_truth,
-    read_bag_truth,
+    read_poses,
 )
-from gvo.io.poses.tf import read_tf
 from gvo.types import Failure, FloatArray
 from tests.make.bags import FIX, ODOMETRY, STAMPED, TRANSFORM, WITH_COVARIANCE, PoseBag
 
@@ -34,8 +31,8 @@ def pose(n: float) -> FloatArray:
     return se3.exp(n * np.array([0.05, 0.1, -0.2, 1.0, 0.5, 0.0]))
 
 
-def read(path: Path, spec: BagTruthSpec) -> BagTruth:
-    return read_bag_truth(BagReader(path), spec, where=path.name)
+def read(path: Path, spec: BagTruthSpec) -> Poses:
+    return read_poses(BagReader(path), spec, where=path.name)
 
 
 @pytest.mark.parametrize("name", ["a.bag", "a.mcap"])
@@ -49,12 +46,12 @@ def test_a_topic_gives_poses_at_the_stamps_of_its_headers(
     bag = PoseBag(tmp_path / name)
     for n in (3, 1, 2):  # recorded out of order, at other times than their stamps
         bag.pose("/truth", type_, n * SECOND + 5, pose(n), parent="/map", child="/base")
-    truth = read(bag.write(), TopicTruth(name="truth"))
+    truth = read(bag.write(), "truth")
     assert truth.trajectory.stamps_ns.tolist() == [n * SECOND + 5 for n in (1, 2, 3)]
     expected = np.stack([pose(n) for n in (1, 2, 3)])
     np.testing.assert_allclose(truth.trajectory.T_world_frame, expected, atol=1e-12)
     assert truth.trajectory.stamps_from == "topic"
-    assert (truth.parent_frame, truth.child_frame) == ("map", child)
+    assert truth.child_frame == child
     assert truth.decision == f"/truth ({type_}), 3 poses{' of base' if child else ''}"
 
 
@@ -63,7 +60,7 @@ def test_of_two_poses_of_one_stamp_the_later_counts_and_bad_ones_are_told(tmp_pa
     bag.pose("/truth", STAMPED, 1, pose(1))
     bag.pose("/truth", STAMPED, 1, pose(2))
     bag.pose("/truth", STAMPED, 2, pose(3), norm=0.0)
-    truth = read(bag.write(), TopicTruth(name="/truth"))
+    truth = read(bag.write(), "/truth")
     np.testing.assert_allclose(truth.trajectory.T_world_frame, [pose(2)], atol=1e-12)
     assert "1 poses; 1 messages hold no pose and were skipped; the first: /truth" in truth.decision
 
@@ -73,7 +70,7 @@ def test_fixes_are_positions_without_rotations(tmp_path: Path) -> None:
     for n in range(3):
         bag.fix(n * SECOND, [48.0, 11.0, 500.0 + n])
     bag.fix(9 * SECOND, [48.0, 11.0, 500.0], status=-1)
-    truth = read(bag.write(), TopicTruth(name="/fix"))
+    truth = read(bag.write(), "/fix")
     assert not truth.trajectory.has_rotations
     np.testing.assert_allclose(truth.trajectory.positions[:, 2], [0.0, 1.0, 2.0], atol=1e-6)
     assert truth.child_frame == "gps"
@@ -142,7 +139,7 @@ def test_a_topic_that_is_not_there_is_refused_with_those_that_are(tmp_path: Path
     bag = chain_bag(tmp_path / "a.bag")
     bag.fix(0, [0, 0, 0])
     with pytest.raises(RecordingError, match=r"a.bag: has no poses on topic /odom.*/fix \("):
-        read(bag.write(), TopicTruth(name="/odom"))
+        read(bag.write(), "/odom")
 
 
 def test_truth_of_converted_data_sets_is_of_the_camera_at_stamps_of_files(tmp_path: Path) -> None:
@@ -162,8 +159,8 @@ def test_truth_of_converted_data_sets_is_of_the_camera_at_stamps_of_files(tmp_pa
 def test_the_recorded_chain_of_odometry_is_the_recorded_topic(gvo_data: Path) -> None:
     path = gvo_data / "bags/good/nav2_turtlebot.mcap"
     chain = read(path, TfTruth(parent="odom", child="base_link"))
-    topic = read(path, TopicTruth(name="/odom"))
-    assert (topic.parent_frame, topic.child_frame) == ("odom", "base_link")
+    topic = read(path, "/odom")
+    assert topic.child_frame == "base_link"
     np.testing.assert_array_equal(chain.trajectory.stamps_ns, topic.trajectory.stamps_ns)
     assert len(chain.trajectory) == 2639
     difference = np.abs(chain.trajectory.T_world_frame - topic.trajectory.T_world_frame).max()
@@ -180,7 +177,7 @@ def test_a_recorded_chain_of_two_moving_edges_is_read(gvo_data: Path) -> None:
     expected = stamps[(stamps >= first) & (stamps <= last)]
     np.testing.assert_array_equal(truth.trajectory.stamps_ns, expected)
     # the filter's own poses, which it turns into the upper edge
-    amcl = read(path, TopicTruth(name="/amcl_pose"))
+    amcl = read(path, "/amcl_pose")
     inner = truth.trajectory.interpolate(amcl.trajectory.stamps_ns)
     known = np.isin(amcl.trajectory.stamps_ns, inner.stamps_ns)
     apart = np.linalg.norm(inner.positions - amcl.trajectory.positions[known], axis=1)
@@ -200,30 +197,26 @@ def recorded_stamps(path: Path, child: str) -> list[int]:
 POSE = np.eye(4)
 
 
-def find(path: Path) -> BagTruth | Failure:
+def find(path: Path) -> Poses | Failure:
     reader = BagReader(path)
-    return find_named_truth(reader, read_tf(reader), where=path.name)
+    return find_named_truth(reader, path.name)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
+def test_names_of_what_measures_from_outside_are_known(tmp_path: Path) -> None:
+    known = [
         *("groundtruth", "/ground_truth/pose", "/ground-truth", "/drone/groundTruth/odometry"),
         *("/gt", "/gt_pose", "/camera/gt", "/vicon/firefly_sbx/firefly_sbx", "/vicon1"),
         *("/mocap_node/robot/pose", "/optitrack", "/leica/position"),
         "/vrpn_client_node/drone/pose",
-    ],
-)
-def test_names_of_what_measures_from_outside_are_known(name: str) -> None:
-    assert is_named_truth(name)
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["/odom", "/odometry/filtered", "/gps/fix", "/height/gtx", "/length", "/viconic", "/amcl_pose"],
-)
-def test_other_names_are_not(name: str) -> None:
-    assert not is_named_truth(name)
+    ]
+    others = ["/odom", "/odometry/filtered", "/gps/pose", "/height/gtx", "/length", "/viconic"]
+    bag = PoseBag(tmp_path / "a.bag")
+    for name in (*known, *others):
+        bag.pose(name, STAMPED, 1, POSE)
+    found = find(bag.write())
+    assert isinstance(found, Failure)
+    assert found.reason.startswith(f"{len(known)} topics")
+    assert all(f"{name} (" in found.reason for name in known)
 
 
 @pytest.mark.parametrize("type_", [ODOMETRY, STAMPED, TRANSFORM])
@@ -232,7 +225,7 @@ def test_the_only_topic_of_such_a_name_is_taken_beside_odometry(tmp_path: Path, 
     bag.pose("/odom", ODOMETRY, 1, POSE)
     bag.pose("/mocap/robot", type_, 2, POSE)
     truth = find(bag.write())
-    assert isinstance(truth, BagTruth)
+    assert isinstance(truth, Poses)
     assert truth.decision.startswith(f"/mocap/robot ({type_}), 1 poses")
 
 
@@ -240,7 +233,7 @@ def test_measured_points_are_taken_as_well(tmp_path: Path) -> None:
     bag = PoseBag(tmp_path / "a.bag")
     bag.point("/leica/position", 1, (1.0, 2.0, 3.0), frame="leica")
     truth = find(bag.write())
-    assert isinstance(truth, BagTruth)
+    assert isinstance(truth, Poses)
     assert not truth.trajectory.has_rotations
 
 
@@ -272,7 +265,7 @@ def test_the_frame_of_converted_data_sets_comes_first(tmp_path: Path) -> None:
     bag.pose("/vicon", STAMPED, 1, POSE)
     bag.tf(5, "world", "ground_truth", POSE)
     truth = find(bag.write())
-    assert isinstance(truth, BagTruth)
+    assert isinstance(truth, Poses)
     assert truth.is_of_camera
     assert truth.trajectory.stamps_ns.tolist() == [5]
 
@@ -280,7 +273,7 @@ def test_the_frame_of_converted_data_sets_comes_first(tmp_path: Path) -> None:
 @pytest.mark.recorded
 def test_the_truth_of_a_recorded_bag_of_poses_is_found(gvo_data: Path) -> None:
     truth = find(gvo_data / "bags/good/pose_streams.bag")
-    assert isinstance(truth, BagTruth)
+    assert isinstance(truth, Poses)
     assert truth.decision == "groundtruth (geometry_msgs/msg/PoseStamped), 12765 poses"
 
 
@@ -302,8 +295,8 @@ def test_a_chain_of_tf_is_two_frames_with_or_without_a_slash(parent: str, child:
 
 @given(names)
 def test_a_topic_has_a_slash_or_is_called_one(name: str) -> None:
-    assert parse_bag_truth(name) == parse_truth(f"topic:{name}") == TopicTruth(name=name)
-    slashed = TopicTruth(name=f"/{name}/pose")
+    assert parse_bag_truth(name) == parse_truth(f"topic:{name}") == name
+    slashed = f"/{name}/pose"
     assert parse_truth(f"/{name}/pose") == parse_truth(f"topic:/{name}/pose") == slashed
 
 

@@ -8,17 +8,10 @@ from scipy.spatial.transform import Rotation
 
 import gvo
 from gvo.errors import RecordingError, TrajectoryError
-from gvo.io.poses.base_frame import BaseFrame
-from gvo.io.poses.inputs import (
-    find_base_frame,
-    initial_pose,
-    read_compared,
-    read_ground_truth,
-    read_transforms,
-    read_truth,
-    recorded_truth,
-)
-from gvo.io.poses.truth import Truth
+from gvo.io.bag.source import read_transforms
+from gvo.io.poses.base_frame import BaseFrame, find_base_frame
+from gvo.io.poses.inputs import read_compared, read_ground_truth, read_truth, recorded_truth
+from gvo.io.poses.truth import Truth, initial_pose
 from gvo.io.recording import Source
 from gvo.trajectory.formats import write_tum
 from gvo.trajectory.trajectory import Trajectory

@@ -194,7 +194,6 @@ def test_the_stamps_between_two_frames_are_of_the_moving_edges_of_the_chain(seed
     assert chain[0] == a
     assert chain[-1] == b
     assert buffer.edge_stamps_ns(a, b).tolist() == sorted({s.stamp_ns for s in on_the_way})
-    assert buffer.is_static(a, b) is (not on_the_way)
 
 
 def test_the_rotation_takes_the_shorter_way() -> None:
@@ -243,7 +242,6 @@ def test_an_unknown_frame_is_answered_with_the_nearest_names() -> None:
     assert "base_lnk (the nearest: base_link)" in reason_of(buffer.lookup("a", "base_lnk", 0))
     assert "it holds a, base_link" in reason_of(buffer.lookup("zzz", "a", 0))
     assert "empty" in reason_of(TfBuffer().lookup("a", "b", 0))
-    assert not buffer.is_static("a", "zzz")
     assert not buffer.chain("a", "zzz")
     assert len(buffer.edge_stamps_ns("a", "zzz")) == 0
 
@@ -254,7 +252,6 @@ def test_frames_of_two_trees_are_answered_with_both_roots() -> None:
     reason = reason_of(buffer.lookup("base", "cam", 10**9))
     assert "base ends at map" in reason
     assert "cam at rig" in reason
-    assert not buffer.is_static("base", "cam")
 
 
 @pytest.mark.parametrize("is_static", [True, False])
@@ -280,7 +277,6 @@ def test_a_child_that_changes_its_parent_is_followed() -> None:
     np.testing.assert_allclose(T[:2, 0, 3], [145.0, 1.5])
     assert buffer.chain("a", "cup") == ("a", "hand", "cup")
     assert buffer.edge_stamps_ns("a", "cup").tolist() == [n * 10**9 for n in (1, 2, 4, 5)]
-    assert not buffer.is_static("a", "cup")
     assert "cup changes" in " ".join(buffer.notes)
     assert buffer.lookup_many("a", "cup", np.empty(0, dtype=np.int64))[0].shape == (0, 4, 4)
 
@@ -357,7 +353,6 @@ def test_topics_of_static_transforms_are_known_by_their_name(write_bag: WriteBag
     )
     buffer = read_tf(reader)
     assert buffer.frames == ("base", "cam", "odom")
-    assert buffer.is_static("cam", "base")
     assert buffer.edge_stamps_ns("odom", "cam").tolist() == [7, 9]
     assert found(buffer.lookup("odom", "cam", 8))[0, 3] == 2.0
 

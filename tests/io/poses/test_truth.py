@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 
 from gvo.geometry import se3
 from gvo.io.bag.reader import BagReader
-from gvo.io.poses.ground_truth import BagTruth, TfTruth, TopicTruth
 from gvo.io.poses.tf import TfBuffer, read_tf
-from gvo.io.poses.truth import Truth, find_truth, in_frame
+from gvo.io.poses.truth import BagTruthSpec, Poses, TfTruth, Truth, find_truth, in_frame
 from gvo.trajectory.evaluation import evaluate
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FloatArray
@@ -36,10 +35,9 @@ def trajectory(poses: FloatArray) -> Trajectory:
     return Trajectory(stamps_ns=stamps_ns, T_world_frame=poses, stamps_from="topic")
 
 
-def truth_of(found: Trajectory, child: str, *, is_of_camera: bool = False) -> BagTruth:
-    return BagTruth(
+def truth_of(found: Trajectory, child: str, *, is_of_camera: bool = False) -> Poses:
+    return Poses(
         trajectory=found,
-        parent_frame="map",
         child_frame=child,
         decision="it was read",
         is_of_camera=is_of_camera,
@@ -52,7 +50,7 @@ def mounted() -> TfBuffer:
     return buffer
 
 
-def framed(*arguments: BagTruth | TfBuffer, **options: object) -> Truth:
+def framed(*arguments: Poses | TfBuffer, **options: object) -> Truth:
     found = in_frame(*arguments, **options)  # type: ignore[arg-type]
     assert isinstance(found, Truth)
     return found
@@ -185,12 +183,10 @@ def robot(path: Path, *, truth: str) -> BagReader:
     return BagReader(bag.write())
 
 
-@pytest.mark.parametrize(
-    "spec", [None, TopicTruth(name="/gt"), TfTruth(parent="odom", child="base")]
-)
+@pytest.mark.parametrize("spec", [None, "/gt", TfTruth("odom", "base")])
 @pytest.mark.parametrize("name", ["a.bag", "a.mcap"])
 def test_what_is_asked_for_or_named_comes_in_the_frame_of_the_camera(
-    tmp_path: Path, spec: TopicTruth | TfTruth | None, name: str
+    tmp_path: Path, spec: BagTruthSpec | None, name: str
 ) -> None:
     reader = robot(tmp_path / name, truth="/gt")
     for buffer in (None, read_tf(reader)):

@@ -13,7 +13,8 @@ import gvo
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
 from gvo.geometry.se3 import make_transform
-from gvo.io.poses.inputs import find_base_frame, read_truth
+from gvo.io.poses.base_frame import find_base_frame
+from gvo.io.poses.inputs import read_truth
 from gvo.io.poses.truth import Truth, TruthComparison
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
