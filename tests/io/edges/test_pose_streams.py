@@ -19,6 +19,8 @@ from gvo.io.edges.pose_streams import (
     step_covariance,
 )
 from gvo.trajectory.formats import (
+    COVARIANCE_HEADER,
+    format_covariance_line,
     write_kitti,
     write_tum,
 )
