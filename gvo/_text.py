@@ -66,9 +66,7 @@ def shortened_words(text: str) -> str:
 
 
 def visible(text: str) -> str:
-    r"""Return a text with what cannot be seen, or orders others about, escaped.
-
-    Those are line ends, escape sequences, and marks that turn the direction of writing.
+    r"""Escape control, invisible and direction-changing characters.
 
     Examples
     --------

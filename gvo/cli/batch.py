@@ -13,7 +13,7 @@ import typer
 from typer import Argument, Option
 
 from gvo.cli import options as opt
-from gvo.cli.terminal import at_work, exit_code, is_shown, say, told_where_it_stands, warn
+from gvo.cli.terminal import exit_code, interruptible_run, is_shown, say, warn
 from gvo.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -76,9 +76,12 @@ def batch(
     check_place(out, make_tasks(found, variants), batch_options)
     counts = _count(len(found), "recording"), _count(len(variants), "configuration")
     say(", ".join(counts))
-    told = told_where_it_stands(out, and_then=": the same command goes on")
-    with at_work(told, _progress()) as work, connected(scheduler, workers) as client:
-        progress = work.on_progress
+    with (
+        interruptible_run(out, and_then=": the same command goes on") as work,
+        _progress() as show,
+        connected(scheduler, workers) as client,
+    ):
+        progress = work.checking(show)
         table = run_batch(
             found, variants, out=out, client=client, options=batch_options, on_progress=progress
         )

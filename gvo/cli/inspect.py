@@ -10,12 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from typer import Argument, Option
 
 from gvo.cli import options as opt
-from gvo.cli.terminal import (
-    interruptible,
-    progress,
-    say,
-    warn,
-)
+from gvo.cli.terminal import interruptible, progress, say, warn
 from gvo.errors import ConfigurationError, GvoError
 
 if TYPE_CHECKING:
@@ -40,7 +35,7 @@ def explain(
     parameters: opt.Parameters,
     options: opt.Options,
 ) -> None:
-    """Show one frame from image to pose, step by step, as pictures."""
+    """Draw how one frame becomes a pose, step by step."""
     from gvo.diagnostics.explain import explain_frame
     from gvo.io.excerpt import make_excerpt
     from gvo.viz.explanation import write_explanation
@@ -62,7 +57,7 @@ def view(
     ],
     *,
     host: Annotated[
-        str, Option(metavar="ADDRESS", help="Where to listen; 0.0.0.0 is everywhere.")
+        str, Option(metavar="ADDRESS", help="Address to listen on; 0.0.0.0 lets all machines in.")
     ] = "127.0.0.1",
     port: Annotated[int, Option(min=0, max=65535, help="Port; 0 takes a free one.")] = (
         _DEFAULT_PORT
@@ -71,7 +66,7 @@ def view(
     set_: opt.Settings = None,
     options: opt.Options,
 ) -> None:
-    """Watch odometry in the browser, with its parameters as controls."""
+    """Watch odometry in the browser and change its parameters."""
     from gvo.viz.view import serve
     from gvo.viz.view.player import Player
 
@@ -81,7 +76,7 @@ def view(
                 f"{path}: is a run, not a recording; open {path / 'report.html'} to look at it "
                 "(gvo run --rerun FILE writes it for Rerun)"
             )
-    with interruptible() as check, ExitStack() as stack:
+    with interruptible() as work, ExitStack() as stack:
         reopen = partial(opt.open_source, recordings, options=options)
         player = stack.enter_context(Player(reopen, opt.load(config, set_)))
         truth = _find_truth(player.source)
@@ -89,11 +84,11 @@ def view(
         warn([server.note] if server.note else [])
         say(f"{server.url} shows {recordings[0].name}; Ctrl-C ends")
         while not server.wait(_SIGNALS_S):
-            check(None)
+            work.check()
 
 
 def _find_truth(source: Source) -> Trajectory | None:
-    """Return what the recording itself names its ground truth; it is not needed to watch."""
+    """Return the ground truth that the recording itself holds, if any."""
     from gvo.io.poses.inputs import recorded_truth
     from gvo.types import Failure
 

@@ -15,7 +15,7 @@ from typer import Argument, Option
 
 from gvo._text import cut
 from gvo.cli import options as opt
-from gvo.cli.terminal import ended_by_a_signal, exit_code, say, tell, told_where_it_stands, warn
+from gvo.cli.terminal import ended_by_a_signal, exit_code, say, tell, warn
 from gvo.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -43,41 +43,44 @@ def live(
         list[str],
         Argument(
             metavar="CAMERA...",
-            help="ros1; ros2; - for standard input; or camera and its devices: 0, a film.",
+            help="ros1, ros2, - (standard input), or camera with a device number or video file.",
         ),
     ],
     *,
     options: opt.Options,
-    sensor: Annotated[_Sensor, Option(help="What standard input gives.")] = "stereo",
+    sensor: Annotated[_Sensor, Option(help="Kind of camera on standard input.")] = "stereo",
     is_rectified: Annotated[
-        bool, Option("--rectified", help="The images of - and camera are rectified already.")
+        bool, Option("--rectified", help="Do not rectify the images of - and camera.")
     ] = False,
     frame: Annotated[
-        str | None, Option(metavar="NAME", help="The robot's frame, such as base_link.")
+        str | None, Option(metavar="NAME", help="Base frame of the robot, such as base_link.")
     ] = None,
-    world: Annotated[str, Option(metavar="NAME", help="The fixed frame of what is sent.")] = "map",
+    world: Annotated[str, Option(metavar="NAME", help="Name of the fixed frame sent.")] = "map",
     with_tf: Annotated[bool, Option("--tf/--no-tf", help="Send transforms.")] = True,
-    qos: Annotated[_Qos, Option(help="How images are received from ROS 2.")] = "sensor",
+    qos: Annotated[_Qos, Option(help="How to receive images from ROS 2.")] = "sensor",
     foxglove: Annotated[
-        str | None, Option(metavar="[HOST:]PORT", help="Serve Foxglove there, too.")
+        str | None, Option(metavar="[HOST:]PORT", help="Serve Foxglove at this port.")
     ] = None,
     view: Annotated[
-        str | None, Option(metavar="[HOST:]PORT", help="Serve the page in the browser there.")
+        str | None, Option(metavar="[HOST:]PORT", help="Serve a page for the browser at this port.")
     ] = None,
     out: opt.Out = None,
     force: opt.Force = False,
     parameters: opt.LoopParameters,
     queue: Annotated[
-        int, Option(metavar="N", help="Pairs that wait; the oldest is dropped for one more.")
+        int, Option(metavar="N", help="Keep at most N image pairs waiting; drop the oldest.")
     ] = 10,
     max_lag: Annotated[
         float | None,
-        Option(metavar="S", help="Drop pairs whose poses would come later, but the newest."),
+        Option(
+            metavar="S",
+            help="Skip image pairs when more than S seconds behind; always process the newest.",
+        ),
     ] = None,
     bag: opt.Bag = None,
     with_report: opt.Report = True,
 ) -> None:
-    """Track a running camera: of ROS, through a pipe, or a device."""
+    """Track a running camera: ROS topics, standard input or a device."""
     from gvo.io.poses.base_frame import find_base_frame
     from gvo.live.odometry import LiveOdometry
     from gvo.runs.outputs.options import RunOutputs
@@ -87,7 +90,7 @@ def live(
     outputs.check(force=force)
     page = None if view is None else _address("--view", view)
     end = _End()
-    with ExitStack() as stack, told_where_it_stands(out), ended_by_a_signal(end):
+    with ExitStack() as stack, ended_by_a_signal(end, out):
         sinks = _connect(camera, qos, foxglove, stack)
         kind, *devices = camera
         if kind in _NETWORKS:
@@ -112,7 +115,7 @@ def live(
 
 
 class _End:
-    """Ends what is waited for, and then the run, by a signal."""
+    """What the first signal does: it ends the wait for a camera, and later the run."""
 
     def __init__(self) -> None:
         self.has_come = threading.Event()
@@ -123,14 +126,14 @@ class _End:
         self._stop()
 
     def follow(self, stop: Callable[[], None]) -> None:
-        """Let the signal stop this from now on, also one that has come."""
+        """Call `stop` when the signal comes, now if it has come."""
         self._stop = stop
         if self.has_come.is_set():
             stop()
 
 
 def _connect(words: list[str], qos: _Qos, foxglove: str | None, stack: ExitStack) -> list[Sink]:
-    """Join the network that the images come from, if any, and serve viewers."""
+    """Join the ROS network and start the server of Foxglove, as asked for."""
     kind, *rest = words
     is_right = {"camera": bool(rest), "ros1": all(":=" in word for word in rest)}
     if kind not in _KINDS or not is_right.get(kind, not rest):
@@ -169,7 +172,7 @@ def _address(option: str, text: str) -> tuple[str, int]:
 
 
 def _show(odometry: LiveOdometry, source: Source, page: tuple[str, int], stack: ExitStack) -> None:
-    """Serve the page of a run until it ends."""
+    """Serve the page of a run until `stack` closes."""
     from gvo.viz.view import serve
     from gvo.viz.view.live import LivePlayer
 
@@ -182,7 +185,7 @@ def _show(odometry: LiveOdometry, source: Source, page: tuple[str, int], stack: 
 def _wait(
     network: Sink, config: Config, options: RecordingOptions, end: _End, frame: str | None
 ) -> tuple[Source, BaseFrame]:
-    """Return the camera and the frame whose poses are wanted, once all about both is known."""
+    """Wait for the topics of a camera and its calibration; return it with its base frame."""
     from gvo.io.poses.base_frame import find_base_frame
     from gvo.live.topics import NetworkReader, TopicSource, wait_for
 
@@ -218,7 +221,7 @@ def _own_camera(
 
 
 def _status(odometry: LiveOdometry) -> Callable[[Progress], None]:
-    """Return a callback that says every few seconds how it goes."""
+    """Return a callback that says every few seconds how many frames were tracked."""
     said_s = started_s = time.monotonic()
 
     def show(progress: Progress) -> None:

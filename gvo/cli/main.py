@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import sys
-from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -23,17 +22,15 @@ from gvo.cli.live import live
 from gvo.cli.terminal import (
     EXIT_FAULTS,
     EXIT_UNUSABLE,
-    at_work,
     ended_by_signals,
     exit_code,
     interruptible,
+    interruptible_run,
     progress,
     report,
     report_smoothed,
     say,
     status,
-    told_what_stands,
-    told_where_it_stands,
     warn,
 )
 from gvo.errors import ConfigurationError, GvoError, OutputError, named_faults
@@ -73,7 +70,7 @@ def _options(
         bool, Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    """Take the options that stand before a command; without one, show what there is."""
+    """Without a command, list the commands."""
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
         raise typer.Exit(EXIT_UNUSABLE)
@@ -88,10 +85,14 @@ def demo(
 
     check_place(out)
     say(f"rendering a drive into {out / BAG_NAME}")
-    told = told_what_stands(f"what is done is in {out}; the same command begins anew")
-    with at_work(told, progress("demo")) as work:
-        check, on_progress, on_written = work
-        result = run_demo(out, on_rendered=check, on_progress=on_progress, on_written=on_written)
+    stands = f"what is done is in {out}; the same command begins anew"
+    with interruptible(stands) as work, progress("demo") as show:
+        result = run_demo(
+            out,
+            on_rendered=work.check,
+            on_progress=work.checking(show),
+            on_written=work.note_written,
+        )
     report(result, out)
 
 
@@ -104,33 +105,26 @@ def run(
     parameters: opt.LoopParameters,
     excerpt: opt.Excerpt,
     frame: Annotated[
-        str | None, Option(metavar="NAME", help="Frame of tf whose poses are written.")
+        str | None, Option(metavar="NAME", help="Write the poses of this frame of tf.")
     ] = None,
     initial_pose: Annotated[
         str | None,
-        Option(
-            metavar="POSE", help="Pose of the first frame: X,Y,Z[,QX,QY,QZ,QW] in metres, or truth."
-        ),
+        Option(metavar="POSE", help="First pose: X,Y,Z[,QX,QY,QZ,QW] in metres, or truth."),
     ] = None,
     ground_truth: Annotated[
         str | None,
-        Option(metavar="WHAT", help="File of poses, or in the bag: tf:PARENT:CHILD, /TOPIC."),
+        Option(metavar="WHAT", help="Pose file, or tf:PARENT:CHILD or /TOPIC in the bag."),
     ] = None,
     bag: opt.Bag = None,
     world: Annotated[
-        str, Option(metavar="NAME", help="The fixed frame in that bag, such as odom or map.")
+        str, Option(metavar="NAME", help="Name of the fixed frame in that bag.")
     ] = "world",
     overlay: Annotated[
-        Path | None,
-        Option(metavar="FILE", help="Film the matches: .webm, .mp4, or a folder of PNG."),
+        Path | None, Option(metavar="FILE", help="Film the matches: .webm, .mp4, or a folder.")
     ] = None,
-    rerun: Annotated[
-        Path | None, Option(metavar="FILE", help="Write a .rrd for the Rerun viewer.")
-    ] = None,
+    rerun: Annotated[Path | None, Option(metavar="FILE", help="Write a Rerun file, .rrd.")] = None,
     with_report: opt.Report = True,
-    plots: Annotated[
-        Path | None, Option(metavar="DIR", help="Write each plot as PNG and PDF too.")
-    ] = None,
+    plots: opt.Plots = None,
     options: opt.Options,
 ) -> None:
     """Estimate the trajectory of a recording, with covariances."""
@@ -152,7 +146,7 @@ def run(
     )
     for line in source.info.decisions:
         say(line)
-    with at_work(told_where_it_stands(out), progress(source.info.name)) as work:
+    with interruptible_run(out) as work, progress(source.info.name) as show:
         result = run_recording(
             source,
             out,
@@ -163,8 +157,8 @@ def run(
             excerpt=excerpt,
             outputs=outputs,
             force=force,
-            on_progress=work.on_progress,
-            on_written=work.on_written,
+            on_progress=work.checking(show),
+            on_written=work.note_written,
         )
     report(result, out)
 
@@ -180,7 +174,7 @@ def check_(
     options: opt.Options,
     as_json: _AsJson = False,
 ) -> None:
-    """Look for what would make odometry fail, before it runs."""
+    """Look for what would make odometry fail on a recording."""
     from gvo.diagnostics.check import check_recording, format_check
     from gvo.io.bag.source import read_transforms
 
@@ -203,41 +197,39 @@ def smooth(
     inputs: Annotated[
         list[str],
         Argument(
-            metavar="INPUT...", help="g2o pose graph, files of poses, bag; - for lines of stdin."
+            metavar="INPUT...", help="Pose graph (g2o), pose files or a bag; - reads JSON lines."
         ),
     ],
     out: opt.Out = None,
     force: opt.Force = False,
     topic: Annotated[
         list[str] | None,
-        Option("--topic", metavar="TOPIC", help="Poses in a bag; repeatable: fused."),
+        Option("--topic", metavar="TOPIC", help="Pose topic in a bag. Repeat to fuse several."),
     ] = None,
     sigma: Annotated[
         list[str] | None,
-        Option(
-            "--sigma", metavar="DEG,M", help="Noise of a step; one for all inputs, or one each."
-        ),
+        Option("--sigma", metavar="DEG,M", help="Noise of a step. Repeat to give one per input."),
     ] = None,
     ground_truth: Annotated[
         Path | None, Option(metavar="FILE", help="True poses: TUM, KITTI, EuRoC.")
     ] = None,
     robust: Annotated[
         _Robust | None,
-        Option(help="Against false edges; default: none for a graph, huber for poses."),
+        Option(help="How to weigh down false edges; default: none for a graph, huber for poses."),
     ] = None,
     covariances: Annotated[
-        bool, Option("--covariances", help="Of all poses, which takes longer than them.")
+        bool, Option("--covariances", help="Also compute the covariance of every pose (slower).")
     ] = False,
     window: Annotated[
-        bool, Option("--window", help="Smooth a file by the window, as a stream of lines.")
+        bool, Option("--window", help="Smooth pose by pose in a sliding window, as with -.")
     ] = False,
     keyframes: Annotated[
-        _KeyframePolicy | None, Option(help="Which poses stay in the window.")
+        _KeyframePolicy | None, Option(help="How the window chooses the poses it keeps.")
     ] = None,
     config: opt.ConfigFile = None,
     set_: opt.Settings = None,
 ) -> None:
-    """Optimize edges or poses of any front-end, a graph or a stream."""
+    """Smooth the relative or absolute poses of any front-end."""
     from gvo.io.edges.opening import open_edges, parse_sigma
     from gvo.io.poses.inputs import read_ground_truth
 
@@ -272,18 +264,18 @@ def _smoothed(source: EdgeSource | None, out: Path, window: bool, **options: Any
     from gvo.io.edges.lines import read_lines
     from gvo.runs import smooth
 
-    told = told_where_it_stands(out)
-    if source is None:
-        with at_work(told, nullcontext(lambda _: None)) as work:
-            lines = read_lines(sys.stdin.fileno(), lambda: work.check(None))
-            return smooth.smooth_lines(lines, _answer, out, on_written=work.on_written, **options)
-    if window:
-        with at_work(told, progress(source.name, "poses")) as work:
-            options |= {"on_progress": work.on_progress, "on_written": work.on_written}
-            return smooth.smooth_edges(source, out, **options)
-    with at_work(told, status(source.name)) as work:
-        options |= {"on_step": work.on_progress, "on_written": work.on_written}
-        return smooth.optimize_edges(source, out, **options)
+    with interruptible_run(out) as work:
+        options["on_written"] = work.note_written
+        if source is None:
+            lines = read_lines(sys.stdin.fileno(), work.check)
+            return smooth.smooth_lines(lines, _answer, out, **options)
+        if window:
+            with progress(source.name, "poses") as show:
+                on_progress = work.checking(show)
+                return smooth.smooth_edges(source, out, on_progress=on_progress, **options)
+        with status(source.name) as show_text:
+            on_step = work.checking(show_text)
+            return smooth.optimize_edges(source, out, on_step=on_step, **options)
 
 
 def _answer(line: str) -> None:
@@ -296,24 +288,22 @@ def _answer(line: str) -> None:
 def compare(
     reference: Annotated[
         str,
-        Argument(help="File (TUM, KITTI, EuRoC), recording, or BAG#tf:PARENT:CHILD, BAG#TOPIC."),
+        Argument(help="Pose file, recording with truth, BAG#tf:PARENT:CHILD or BAG#TOPIC."),
     ],
-    estimates: Annotated[list[str], Argument(help="Files of poses, or BAG#..., likewise.")],
-    align: Annotated[_Align, Option(help="How the estimates are aligned.")] = "se3",
+    estimates: Annotated[list[str], Argument(help="Pose files, BAG#tf:... or BAG#TOPIC.")],
+    align: Annotated[_Align, Option(help="How to align estimates with the reference.")] = "se3",
     segments: Annotated[
-        str | None, Option(metavar="L,...", help="Segment lengths in m; 100,...,800 or 20,50.")
+        str | None, Option(metavar="L,...", help="Segment lengths in metres, such as 100,200.")
     ] = None,
     segment_step: Annotated[
-        int | None, Option(min=1, metavar="N", help="Start a segment at every Nth pose; 10 or 1.")
+        int | None, Option(min=1, metavar="N", help="Start a segment at every Nth pose.")
     ] = None,
     as_json: _AsJson = False,
     plot: Annotated[Path | None, Option(metavar="FILE", help="Draw a .png, .pdf or .svg.")] = None,
     report_file: Annotated[
         Path | None, Option("--report", metavar="FILE", help="Write a page, .html.")
     ] = None,
-    plots: Annotated[
-        Path | None, Option(metavar="DIR", help="Write its plots as PNG and PDF too.")
-    ] = None,
+    plots: opt.Plots = None,
     force: opt.Force = False,
 ) -> None:
     """Measure trajectories against a reference: ATE, RPE, segments."""
@@ -357,22 +347,19 @@ def convert_(
     recordings: opt.Recordings,
     target: Annotated[Path, Argument(help=".bag, .mcap, .db3, or a folder to make.")],
     *,
-    layout: Annotated[_Layout | None, Option(help="Layout of the folder that is written.")] = None,
+    layout: Annotated[_Layout | None, Option(help="Layout of the folder to write.")] = None,
     rectify: Annotated[bool, Option("--rectify", help="Rectify the images.")] = False,
     png: Annotated[bool, Option("--png", help="Compress the images of a bag.")] = False,
     options: opt.Options,
     parameters: opt.Parameters,
 ) -> None:
-    """Write a data-set folder as a bag, or a bag as such a folder."""
+    """Write a recording as a bag, or as a folder of KITTI, EuRoC or TUM."""
     from gvo.io.convert.common import check_new
     from gvo.io.convert.convert import convert
 
     check_new(target)
     source = opt.open_source(recordings, parameters, options)
-    with (
-        interruptible() as check,
-        told_what_stands(f"{target} is not written; the same command begins anew"),
-    ):
+    with interruptible(f"{target} is not written; the same command begins anew") as work:
         written = convert(
             source,
             target,
@@ -380,7 +367,7 @@ def convert_(
             rectify=rectify,
             compress=png,
             config=parameters,
-            progress=check,
+            progress=work.check,
         )
     say(f"wrote {target}: {written.n_images} images, {written.n_poses} true poses")
     warn(written.skipped)
@@ -390,9 +377,7 @@ def convert_(
 @_command("config")
 def config_(
     *,
-    everything: Annotated[
-        bool, Option("--all", help="Print the parameters for experts too.")
-    ] = False,
+    everything: Annotated[bool, Option("--all", help="Print the expert parameters too.")] = False,
     parameters: opt.Parameters,
 ) -> None:
     """Print the parameters that matter most, or all."""

@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 _LOGGER = logging.getLogger(__name__)
 Settings = Annotated[
     list[str] | None,
-    Option("--set", metavar="SECTION.KEY=VALUE", help="Change a parameter; repeatable."),
+    Option("--set", metavar="SECTION.KEY=VALUE", help="Change a parameter. May be repeated."),
 ]
 ConfigFile = Annotated[
-    Path | None, Option("--config", metavar="FILE", help="YAML, see `gvo config`.")
+    Path | None, Option("--config", metavar="FILE", help="Parameters as `gvo config` prints them.")
 ]
 Loops = Annotated[
-    bool | None, Option("--loops/--no-loops", help="Find loops, write global poses; loops.enabled.")
+    bool | None, Option("--loops/--no-loops", help="Close loops and write global poses.")
 ]
 Recordings = Annotated[
     list[Path], Argument(metavar="RECORDING...", help="Bags, or one data-set folder.")
@@ -38,26 +38,27 @@ Out = Annotated[
 ]
 Force = Annotated[bool, Option("--force", help="Replace earlier results.")]
 Bag = Annotated[
-    Path | None, Option(metavar="FILE", help="Write a .mcap (ROS 2) or .bag (ROS 1) too.")
+    Path | None, Option(metavar="FILE", help="Also write a .mcap (ROS 2) or .bag (ROS 1).")
 ]
-Report = Annotated[bool, Option("--report/--no-report", help="Draw the picture and report.html.")]
+Report = Annotated[bool, Option("--report/--no-report", help="Draw plots and report.html.")]
+Plots = Annotated[Path | None, Option(metavar="DIR", help="Also write each plot as PNG and PDF.")]
 Start = Annotated[float, Option(metavar="S", help="Seconds to skip at the start.")]
 Every = Annotated[int, Option(metavar="N", help="Take every Nth frame.")]
 
 
 class _Group(NamedTuple):
-    """Marks a parameter of a command that stands for the options of a function."""
+    """Marks a parameter of a command: the options of `make`, whose result it is given."""
 
     make: Callable[..., Any]
 
 
 def add_command(app: typer.Typer, name: str | None = None) -> Callable[[Callable[..., None]], Any]:
-    """Return a decorator that adds a command, with the options of its groups in their places."""
+    """Return a decorator that adds a command; see `_Group`."""
     return lambda run: app.command(name, cls=Command)(_ungrouped(run))
 
 
 def _ungrouped(run: Callable[..., None]) -> Callable[..., None]:
-    """Take the options of each group, and give the command what its function makes of them."""
+    """Return a command that has the options of each group in place of its parameter."""
     groups: dict[str, tuple[Callable[..., Any], list[str]]] = {}
     options: list[inspect.Parameter] = []
     for name, option in inspect.signature(run, eval_str=True).parameters.items():
@@ -93,7 +94,7 @@ def load(config: ConfigFile = None, set_: Settings = None) -> "Config":
 
 
 def with_loops(settings: list[str] | None, loops: bool | None) -> list[str]:
-    """Return the settings, that of loops behind the others where it is given."""
+    """Return the settings with `loops.enabled`, where `--loops` was given."""
     return [*(settings or []), *([] if loops is None else [f"loops.enabled={str(loops).lower()}"])]
 
 
@@ -122,9 +123,7 @@ def _topic(images: str) -> Any:  # noqa: ANN401 - has no public type
 def _recording_options(
     calibration: Annotated[
         list[Path] | None,
-        Option(
-            metavar="FILE", help="ROS, Kalibr or EuRoC YAML, repeatable; replaces the recording's."
-        ),
+        Option(metavar="FILE", help="Use this ROS, Kalibr or EuRoC YAML. May be repeated."),
     ] = None,
     left: Annotated[str | None, _topic("left")] = None,
     right: Annotated[str | None, _topic("right")] = None,

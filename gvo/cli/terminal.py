@@ -9,9 +9,8 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, NoReturn, TextIO
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TextIO
 
 import typer
 from typer import Option
@@ -33,7 +32,6 @@ EXIT_UNUSABLE = 2
 
 _LOGGER = logging.getLogger("gvo")
 _LEVELS = {True: logging.DEBUG, None: logging.WARNING, False: logging.ERROR}
-_WRITTEN = "all is written"
 
 
 def _set_verbosity(value: bool | None) -> None:
@@ -51,29 +49,29 @@ Verbose = Annotated[
         "-v/-q",
         callback=_set_verbosity,
         expose_value=False,
-        help="Log what is done; or print nothing but errors.",
+        help="Print what gvo does, or errors only.",
     ),
 ]
 """The option of every command."""
 
 
 class Command(TyperCommand):
-    """A command that counts what image libraries print, and does not show it."""
+    """A command that hides what image libraries print, and says how many lines it was."""
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - Typer's
-        """Run the command; the workers of a batch have its standard error, too."""
+        """Run the command."""
         with chatter_counted():
             return super().invoke(ctx)
 
 
 @contextmanager
 def chatter_counted() -> Iterator[None]:
-    """Take what libraries write to standard error past Python, and say how much it was."""
+    """Hide what libraries write to standard error past Python; say how many lines it was."""
     own = sys.stderr
     try:
         number = own.fileno()
     except (OSError, ValueError):
-        yield  # nothing but Python can write to it
+        yield  # replaced, as in tests: libraries cannot write to it
         return
     own.flush()
     kept, (reader, writer) = os.dup(number), os.pipe()
@@ -108,7 +106,7 @@ def _tell_chatter(reader: int) -> None:
 
 
 def say(text: object, *, nl: bool = True, err: bool = False) -> None:
-    """Print what is not an error, unless --quiet was given."""
+    """Print a result or a note, unless --quiet was given."""
     if _LOGGER.isEnabledFor(logging.WARNING):
         lines = [str(text)] if nl else str(text).split("\n")
         typer.echo("\n".join(map(visible, lines)), nl=nl, err=err)
@@ -163,7 +161,7 @@ def report_smoothed(result: RunResult, out: Path, *, is_stdout_taken: bool = Fal
 
 
 def _error_words(batch: Mapping[str, Any]) -> str:
-    """Return the errors of a batch optimization, and what it began at."""
+    """Return the error of a batch optimization and the errors of its starts, as text."""
     if "error_isam2" in batch:
         return f"error {batch['error_isam2']:.6g} by iSAM2, {batch['error']:.6g} in a batch"
     starts = batch["errors_of_starts"]
@@ -226,7 +224,7 @@ def progress(title: str, unit: str = "frames") -> Iterator[Callable[[Progress], 
 
 @contextmanager
 def status(title: str) -> Iterator[Callable[[str], None]]:
-    """Yield a callback that shows a state in words on a terminal, and nothing in a pipe."""
+    """Yield a callback that shows a text on a terminal, and nothing in a pipe."""
     if not is_shown():
         yield lambda text: None
         return
@@ -237,8 +235,13 @@ def status(title: str) -> Iterator[Callable[[str], None]]:
 
 
 @contextmanager
-def _handling(receive: Callable[[list[int]], None]) -> Iterator[list[int]]:
-    """Call `receive` with the signals so far; an interrupt exits as the first signal says."""
+def _handling(
+    receive: Callable[[list[int]], None], stands: Callable[[], str] = str
+) -> Iterator[list[int]]:
+    """Call `receive` with the signals so far; an interrupt exits as the first signal says.
+
+    What of the work then stands is said in a line.
+    """
     received: list[int] = []
 
     def handle(number: int, frame: object) -> None:
@@ -249,6 +252,8 @@ def _handling(receive: Callable[[list[int]], None]) -> Iterator[list[int]]:
     try:
         yield received
     except KeyboardInterrupt:
+        if words := stands():
+            typer.echo(f"gvo: interrupted; {visible(words)}", err=True)
         raise SystemExit(_EXIT_CODES_OF_SIGNALS[received[0]] if received else 130) from None
     finally:
         for number, handler in before.items():
@@ -271,79 +276,79 @@ def ended_by_signals() -> Iterator[None]:
 
 
 @contextmanager
-def ended_by_a_signal(stop: Callable[[], None]) -> Iterator[None]:
-    """Let the first signal end what has no end of its own; a second one interrupts it."""
+def ended_by_a_signal(stop: Callable[[], None], out: Path) -> Iterator[None]:
+    """Let the first signal call `stop`, and a second one interrupt what then still goes on."""
 
     def receive(received: list[int]) -> None:
         if len(received) > 1:
             raise KeyboardInterrupt
-        # Not here: what stops may be held by the very code that the signal came into.
+        # In a thread: the signal may have come into code that holds a lock which `stop` needs.
         threading.Thread(target=stop, daemon=True).start()
 
-    with _handling(receive):
+    with _handling(receive, lambda: _poses_so_far(out) if out.exists() else ""):
         yield
 
 
-class _UndrawnError(KeyboardInterrupt):
-    """Interrupts what has written all, and only draws."""
+class Work:
+    """Work of many steps, which a signal ends between two of them.
 
+    Parameters
+    ----------
+    stands : str
+        Said of an interrupted work: what of it stands, and how to go on.
+    undrawn : str
+        Said instead once all is written and only pictures are missing.
+    """
 
-@contextmanager
-def interruptible() -> Iterator[Callable[[object], None]]:
-    """Yield a function that ends the work once a signal has come; call it between frames."""
-    kind = KeyboardInterrupt
+    def __init__(self, stands: str, undrawn: str) -> None:
+        self._stands, self._undrawn = stands, undrawn
+        self._has_signal = self._is_written = False
 
-    def receive(received: list[int]) -> None:
-        if kind is _UndrawnError or len(received) > 1:
-            raise kind
+    def receive(self, received: list[int]) -> None:
+        """Note a signal; a second one, or one while pictures are drawn, interrupts at once."""
+        self._has_signal = True
+        if self._is_written or len(received) > 1:
+            raise KeyboardInterrupt
 
-    with _handling(receive) as received:
+    def check(self, state: object = None) -> None:
+        """End the work if a signal has come; called between two steps."""
+        if self._has_signal:
+            raise KeyboardInterrupt
 
-        def check(state: object) -> None:
-            nonlocal kind
-            kind = _UndrawnError if state is _WRITTEN else KeyboardInterrupt
-            if received:
-                raise kind
-
-        yield check
-
-
-@contextmanager
-def told_what_stands(words: str, undrawn: str | None = None) -> Iterator[None]:
-    """Say, if the work is interrupted, what of it stands, and how to go on."""
-    try:
-        yield
-    except KeyboardInterrupt as error:
-        words = undrawn or words if isinstance(error, _UndrawnError) else words
-        typer.echo(f"gvo: interrupted; {visible(words)}", err=True)
-        raise
-
-
-def told_where_it_stands(
-    out: Path | str, *, and_then: str = "; --force begins anew"
-) -> AbstractContextManager[None]:
-    """Say, if the work is interrupted, where its poses are, and how to go on."""
-    undrawn = f"all is computed and in {out}, not drawn{and_then}, gvo compare --report draws it"
-    return told_what_stands(f"the poses so far are in {out}{and_then}", undrawn)
-
-
-class Work(NamedTuple):
-    """What to call as work goes on: between two steps, after each one, once all is written."""
-
-    check: Callable[[object], None]
-    on_progress: Callable[[Any], None]
-    on_written: Callable[[], None]
-
-
-@contextmanager
-def at_work(
-    told: AbstractContextManager[None], drawn: AbstractContextManager[Callable[[Any], None]]
-) -> Iterator[Work]:
-    """Draw how far work is, end it at a signal between two steps, and tell what stands then."""
-    with interruptible() as check, told, drawn as show:
+    def checking(self, show: Callable[[Any], None]) -> Callable[[Any], None]:
+        """Return a callback that shows the progress, then calls `check`."""
 
         def on_progress(progress: object) -> None:
             show(progress)
-            check(progress)
+            self.check()
 
-        yield Work(check, on_progress, partial(check, _WRITTEN))
+        return on_progress
+
+    def note_written(self) -> None:
+        """Note that all is written but the pictures."""
+        self._is_written = True
+        self.check()
+
+    def stands(self) -> str:
+        """Return what is said where the work is interrupted now."""
+        return self._undrawn if self._is_written and self._undrawn else self._stands
+
+
+@contextmanager
+def interruptible(stands: str = "", undrawn: str = "") -> Iterator[Work]:
+    """Yield work that a signal ends; see `Work`."""
+    work = Work(stands, undrawn)
+    with _handling(work.receive, work.stands):
+        yield work
+
+
+def interruptible_run(
+    out: Path, *, and_then: str = "; --force begins anew"
+) -> AbstractContextManager[Work]:
+    """Return work that writes poses into a folder while it goes on."""
+    undrawn = f"all is computed and in {out}, not drawn{and_then}, gvo compare --report draws it"
+    return interruptible(_poses_so_far(out, and_then), undrawn)
+
+
+def _poses_so_far(out: Path, and_then: str = "") -> str:
+    return f"the poses so far are in {out}{and_then}"
