@@ -2,10 +2,11 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +22,38 @@ settings.register_profile("gvo", deadline=None, derandomize=True, max_examples=2
 settings.register_profile("thorough", deadline=None, derandomize=True, max_examples=75)
 settings.register_profile("explore", deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "gvo"))
+
+
+# Tests with one of these marks may be skipped where what they need is missing; none in CI.
+_OPTIONAL = {"browser", "dds", "realsense", "recorded", "rerun", "ros1"}
+_IS_CI = os.environ.get("CI") == "true"
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out tests of Linux elsewhere."""
+    if sys.platform != "linux":
+        others = [item for item in items if item.get_closest_marker("linux")]
+        config.hook.pytest_deselected(items=others)
+        items[:] = [item for item in items if item not in others]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, Any, pytest.TestReport]:
+    """Turn a skip into a failure: in CI each, elsewhere those without a mark of `_OPTIONAL`."""
+    report: pytest.TestReport = yield
+    names = {mark.name for mark in item.iter_markers()}
+    if report.skipped and not hasattr(report, "wasxfail") and (_IS_CI or not names & _OPTIONAL):
+        report.outcome, report.longrepr = "failed", f"may not be skipped: {report.longrepr}"
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report() -> Generator[None, Any, pytest.CollectReport]:
+    """Turn the skip of a whole module into a failure in CI."""
+    report: pytest.CollectReport = yield
+    if report.skipped and _IS_CI:
+        report.outcome, report.longrepr = "failed", f"may not be skipped: {report.longrepr}"
+    return report
 
 
 class Answer(NamedTuple):
@@ -111,11 +144,11 @@ def line_of_poses(path: Path, n: int = 20) -> Path:
     return path
 
 
-def listeners(port: int) -> set[str]:
-    """Return the local addresses that listen on a port, as the kernel lists them."""
-    rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
-    ends = [row[1].split(":") for row in rows if row[3] == "0A"]
-    return {address for address, at in ends if int(at, 16) == port}
+def assert_open_to_this_machine_alone(port: int) -> None:
+    """Check that a port listens on 127.0.0.1 only; 127.0.0.2 is this machine's too."""
+    socket.create_connection(("127.0.0.1", port), timeout=60).close()
+    with pytest.raises(OSError, match=r"refused|timed out|assign"):
+        socket.create_connection(("127.0.0.2", port), timeout=5).close()
 
 
 @pytest.fixture(scope="session")

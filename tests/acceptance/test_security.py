@@ -216,7 +216,7 @@ def watched(tmp_path: Path) -> Watched:
     return Watched(tmp_path.resolve() / "watched")
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.linux
 def test_commands_write_only_what_they_are_told_to(small_bag: Path, watched: Watched) -> None:
     bag, out = str(small_bag), str(watched.out)
     extras = ["--bag", f"{out}/run.mcap", "--overlay", f"{out}/film.webm"]
@@ -241,7 +241,7 @@ def test_commands_write_only_what_they_are_told_to(small_bag: Path, watched: Wat
     }
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.linux
 def test_a_run_without_report_writes_nothing_else_at_all(small_bag: Path, watched: Watched) -> None:
     commands = [
         ["run", str(small_bag), "--out", str(watched.out / "run"), "--no-report"],
@@ -254,7 +254,7 @@ def test_a_run_without_report_writes_nothing_else_at_all(small_bag: Path, watche
     assert list(watched.places["matplotlib"].iterdir()) == []
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.linux
 def test_a_deed_elsewhere_is_seen(watched: Watched, small_bag: Path) -> None:
     # The hook itself: a converted bag beside `--out` is named by it.
     target = watched.places["cwd"] / "drive.mcap"

@@ -2,7 +2,6 @@
 
 import signal
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -135,7 +134,7 @@ def test_a_scheduler_that_is_lost_is_a_line_and_the_batch_goes_on_with_another(
 
 
 @pytest.mark.acceptance
-@pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
+@pytest.mark.linux
 def test_a_worker_with_another_disk_or_version_says_so(
     tmp_path: Path, bags: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

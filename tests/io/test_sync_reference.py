@@ -17,10 +17,14 @@ from gvo.types import FaultyFrame
 
 _HEADERS = ("message_filters/sync_policies/approximate_time.h", "ros/message_event.h")
 
-pytestmark = pytest.mark.skipif(
-    which("g++") is None or not all((Path("/usr/include") / name).exists() for name in _HEADERS),
-    reason="needs g++ and message_filters of ROS 1 (libmessage-filters-dev)",
-)
+_IS_THERE = which("g++") and all((Path("/usr/include") / name).exists() for name in _HEADERS)
+
+pytestmark = [
+    pytest.mark.ros1,
+    pytest.mark.skipif(
+        not _IS_THERE, reason="needs g++ and message_filters of ROS 1 (libmessage-filters-dev)"
+    ),
+]
 
 # Reads a line per sequence: queue size, limit, age penalty, then stream and stamp of each image.
 # Writes a line: for each pair the number of images pushed so far, and the places of both images

@@ -27,6 +27,8 @@ from gvo.live.dds import Dds, message_class, sockets
 from tests.conftest import GVO, Command, assert_same_files, refused, run_of
 from tests.live.ros1 import Program
 
+pytestmark = pytest.mark.dds
+
 HOLD_S = 60.0
 STRING = "std_msgs/msg/String"
 IMAGE = "sensor_msgs/msg/Image"
@@ -317,7 +319,7 @@ say(answer(2).text)
     assert "/gvo/echo: a request is left out" in caplog.text
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.linux
 def test_no_port_is_open_beyond_loopback(domain: int) -> None:
     before = sockets()
     dds = Dds()

@@ -28,7 +28,7 @@ from gvo.live.transport import SET_POSE, TRIGGER, NetworkWriter, Parameters, Ser
 from gvo.runs.outputs.bag import RunMessages
 from gvo.runs.outputs.frames import RunFrames
 from gvo.types import FrameResult, StereoFrame
-from tests.conftest import Command, listeners, refused
+from tests.conftest import Command, assert_open_to_this_machine_alone, refused
 from tests.live.pipe import LiveCommand, sent
 from tests.viz.view.fakes import result_of
 
@@ -307,10 +307,8 @@ def test_the_command_ends_in_one_line_where_the_port_is_taken_or_the_package_mis
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="no list of open ports")
 def test_it_listens_on_this_machine_alone(server: Foxglove) -> None:
-    port = int(server.url.rpartition(":")[2])
-    assert listeners(port) == {"0100007F"}
+    assert_open_to_this_machine_alone(int(server.url.rpartition(":")[2]))
 
 
 def test_a_closed_server_lets_go_of_its_port_and_takes_no_harm(server: Foxglove) -> None:

@@ -14,6 +14,7 @@ import pytest
 import gvo
 from tests.conftest import GVO
 
+pytestmark = pytest.mark.realsense
 rs = pytest.importorskip("pyrealsense2", exc_type=ImportError)
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"

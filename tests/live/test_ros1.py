@@ -17,6 +17,8 @@ from gvo.types import FloatArray
 from tests.conftest import GVO, assert_same_files, python, refused, run_of
 from tests.live.ros1 import PATIENCE_S, Program, Ros
 
+pytestmark = pytest.mark.ros1
+
 FOLDER = Path(__file__).parent
 PEER, DRIVER = FOLDER / "ros1_peer.py", FOLDER / "ros1_driver.py"
 PLAYER = FOLDER.parents[1] / "scripts" / "ros" / "play.py"

@@ -130,7 +130,6 @@ except RecordingError as error:
 
 @_SUFFIXES
 def test_a_film_too_large_for_the_disk_is_told_and_not_left(tmp_path: Path, suffix: str) -> None:
-    pytest.importorskip("resource")  # of Unix, where a file may be forbidden to grow
     name = f"film{suffix}"
     answer = _in_a_process(_ON_A_FULL_DISK, tmp_path, name)
     assert re.fullmatch(
@@ -221,6 +220,7 @@ _PLAYER = """<body style="margin: 0"><video muted src="film.webm"></video>"""
 
 
 @pytest.mark.acceptance
+@pytest.mark.browser
 def test_a_film_plays_in_a_browser(tmp_path: Path, browser: Browser) -> None:
     _write(tmp_path / "film.webm")
     (tmp_path / "page.html").write_text(_PLAYER)

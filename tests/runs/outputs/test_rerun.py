@@ -1,7 +1,6 @@
 """Runs as files of the Rerun viewer, read back by rerun's own reader."""
 
 import csv
-import os
 import resource
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -16,8 +15,7 @@ import pyarrow as pa  # type: ignore[import-untyped]
 import pytest
 from scipy.spatial.transform import Rotation
 
-if os.environ.get("CI") != "true":
-    pytest.importorskip("rerun")
+pytest.importorskip("rerun")
 import rerun as rr
 from rerun.chunk import RrdReader
 
@@ -43,6 +41,8 @@ from gvo.types import (
 )
 from gvo.viz.palette import COUNTS, LINKS, STAGES
 from tests.results import estimate_at, loop_of, optimum_of, result_of
+
+pytestmark = pytest.mark.rerun
 
 _N_FRAMES = 12
 _ESTIMATES = ("raw", "causal", "smoothed", "global")

@@ -86,6 +86,7 @@ _PICTURES = "return [...document.images].map(i => [i.alt, i.naturalWidth, i.clie
 @pytest.mark.parametrize(
     "explain", [partial(explained, "stereo", "descriptor", 3), partial(explained, "rgbd", "klt", 3)]
 )
+@pytest.mark.browser
 def test_an_explained_frame_opens_from_disk_in_a_browser_with_every_picture(
     browser: Browser, tmp_path: Path, explain: Callable[[], FrameExplanation]
 ) -> None:

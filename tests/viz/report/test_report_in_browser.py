@@ -16,6 +16,8 @@ from tests.viz.browser_checks import changed_share, cut_texts, n_colours, overla
 if TYPE_CHECKING:
     from selenium.webdriver.remote.webelement import WebElement
 
+pytestmark = pytest.mark.browser
+
 MAX_BYTES = 10_000_000
 SECTIONS = 12
 """Sections with a plot, at least: the paths, errors, drift, covariance, counts, times, edges."""

@@ -15,7 +15,7 @@ from tests.viz.browser import Browser
 from tests.viz.browser_checks import changed_share, n_colours
 from tests.viz.view.page_driver import ViewPage
 
-pytestmark = pytest.mark.acceptance
+pytestmark = [pytest.mark.acceptance, pytest.mark.browser]
 
 N_FRAMES = 20
 

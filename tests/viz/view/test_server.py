@@ -10,14 +10,13 @@ import pytest
 from gvo.errors import ConfigurationError
 from gvo.viz.view import serve
 from gvo.viz.view.server import ViewServer, find_port, is_own_page, open_server
-from tests.conftest import listeners
+from tests.conftest import assert_open_to_this_machine_alone
 from tests.viz.view.fakes import FakePlayer, as_player
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_the_page_listens_on_loopback_alone(view: ViewServer) -> None:
     assert view.url.startswith("http://127.0.0.1:")
-    assert listeners(int(view.url.rpartition(":")[2])) == {"0100007F"}
+    assert_open_to_this_machine_alone(int(view.url.rpartition(":")[2]))
 
 
 def test_closing_frees_the_port_and_ends_its_threads() -> None:
