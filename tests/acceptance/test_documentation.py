@@ -29,6 +29,9 @@ MODULES = [
 ]
 
 
+TUTORIALS = ("README.md", "index.md")
+
+
 def blocks(language: str) -> list[tuple[str, str]]:
     return [
         (page.name, block)
@@ -41,7 +44,7 @@ def commands() -> list[tuple[str, list[str]]]:
     """Return the commands of each block; none of a block whose commands another one has, too."""
     found: list[tuple[str, list[str]]] = []
     for page, text in blocks("sh"):
-        if page == "README.md":  # typed from its first line to its last, see below
+        if page in TUTORIALS:  # typed from their first lines to their last, see below
             continue
         lines = [line for line in text.splitlines() if line.startswith("gvo ")]
         # A word in capitals, or a variable of the shell, stands for a file of the reader's own.
@@ -115,11 +118,10 @@ def page_that_ends(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("page_that_ends", "clone")
-def test_the_readme_works_line_by_line_after_its_first_command(command: Command) -> None:
-    lines = [
-        line for page, text in blocks("sh") if page == "README.md" for line in text.splitlines()
-    ]
-    assert len(lines) > 8
+@pytest.mark.parametrize("name", TUTORIALS)
+def test_a_tutorial_works_line_by_line_after_the_demo(command: Command, name: str) -> None:
+    lines = [line for page, text in blocks("sh") if page == name for line in text.splitlines()]
+    assert len(lines) >= 5
     for line in lines:
         program, *words = shlex.split(line)
         if program == "pip":
