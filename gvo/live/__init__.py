@@ -1,4 +1,4 @@
-"""Odometry of a camera that is running: of ROS, from any program, or from a device."""
+"""Odometry of a running camera: topics of ROS, standard input, or a device."""
 
 from gvo.live.odometry import LiveOdometry, LiveRun
 from gvo.live.sources import Device, StandardInput

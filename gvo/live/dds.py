@@ -1,8 +1,8 @@
 """ROS 2 without a ROS installation: its topics and services over CycloneDDS.
 
-The topic `/a/b` of ROS 2 is `rt/a/b` on a DDS network, its type `package::msg::dds_::Name_`, and
-its bytes are CDR as in a bag. The classes that CycloneDDS wants for them are made from the
-definitions that rosbags has: peers compare them, the bytes pass through as they are.
+The topic `/a/b` of ROS 2 is `rt/a/b` in DDS, its type is `package::msg::dds_::Name_`, and its bytes
+are CDR as in a bag. CycloneDDS needs a class for each type, which other participants compare with
+theirs: they are made from the definitions in rosbags. The bytes pass through unchanged.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ ImageQos: TypeAlias = Literal["sensor", "reliable", "system"]
 Receive: TypeAlias = Callable[[Any], None]
 
 _LOGGER = logging.getLogger(__name__)
-# Discovery by multicast and at the first ports of this machine, so that any way to look is met.
+# Discovery by multicast and by the first ports of this machine, for nodes with either setting.
 _LOOPBACK = """<General><AllowMulticast>spdp</AllowMulticast>
 <Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces></General>
 <Discovery><ParticipantIndex>auto</ParticipantIndex>
@@ -51,7 +51,7 @@ _N_IMAGES, _N_OTHERS = 10, 100
 _N_PUBLICATIONS = 10_000
 _CLOCK = Topic(name="/clock", type="rosgraph_msgs/msg/Clock", n_messages=1)
 _TYPE = re.compile(r"(\w+)::msg::dds_::(\w+)_")
-# A request: how it is coded, who asks and its number, its fields. The answer repeats the second.
+# A request has the encoding, then client and number, then its fields; answers repeat the second.
 _CODING, _ASKED = slice(0, 4), slice(4, 20)
 _ANSWERED_WITHIN_S = 2.0
 
@@ -59,21 +59,21 @@ _BASES: Final = {"bool": bool, "string": str, "byte": types.uint8, "char": types
 
 
 class Dds:
-    """The DDS network of ROS 2, on this machine alone unless asked otherwise.
+    """The DDS network of ROS 2, within this machine by default.
 
-    The domain is `ROS_DOMAIN_ID`. `ROS_LOCALHOST_ONLY=0` or `ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET`
-    ask for the whole network, and so does `CYCLONEDDS_URI`, which then says which.
+    The domain is `ROS_DOMAIN_ID`. `ROS_LOCALHOST_ONLY=0`, `ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET`
+    or the settings in `CYCLONEDDS_URI` open it to other machines.
 
     Parameters
     ----------
     qos : {"sensor", "reliable", "system"}
-        How images are received: best effort, as is the custom with sensors; reliably; or as all
-        who write them offer, which is how the rest is received.
+        How to receive images: best effort, as is usual for sensors; reliably; or as all writers
+        offer. Other messages are always received as their writers offer.
 
     Raises
     ------
     ConfigurationError
-        When the domain cannot be joined.
+        If the domain cannot be joined.
     """
 
     is_ros1 = False
@@ -90,7 +90,7 @@ class Dds:
         self._has_clock = False
 
     def topics(self) -> Sequence[Topic]:
-        """Return what others write now, by topic."""
+        """Return the topics that others write."""
         found = {
             endpoint.topic_name.removeprefix("rt"): _TYPE.fullmatch(endpoint.type_name)
             for endpoint in self._writers()
@@ -131,7 +131,7 @@ class Dds:
         return DdsPublisher(pub.DataWriter(self._participant, made, qos))
 
     def serve(self, service: Service) -> None:
-        """Answer requests as the RMW of CycloneDDS sends them, see `_CODING`."""
+        """Answer requests in the format of `rmw_cyclonedds`."""
         type_, qos = service.type, _qos(_N_OTHERS)
         request = self._topic(f"rq{service.name}Request", type_.request_type, kind="srv")
         answer = self._topic(f"rr{service.name}Reply", type_.response_type, kind="srv")
@@ -140,7 +140,7 @@ class Dds:
         self._read(reader, partial(_answer, service, reader, writer))
 
     def offer(self, parameters: Parameters) -> None:
-        """Offer none: they are changed on the page and in Foxglove."""
+        """Do nothing: parameters are changed on the page or in Foxglove."""
 
     def close(self) -> None:
         """Leave the network."""
@@ -155,7 +155,7 @@ class Dds:
         self._readings.append(_Reading(self._participant, reader, receive))
 
     def _writers(self) -> list[builtin.DcpsEndpoint]:
-        """Return what others write with."""
+        """Return the writers of others."""
         own = self._participant.guid
         return [
             endpoint
@@ -180,7 +180,7 @@ class DdsPublisher:
         self._writer = writer
 
     def publish(self, data: bytes, stamp_ns: int) -> None:
-        """Send a message, which has its stamp; lost where who reads it is too far behind."""
+        """Send a message; readers that are too far behind miss it."""
         with suppress(core.DDSException):
             self._writer.write(_of_bytes(self._writer.data_type, data))
 
@@ -191,7 +191,7 @@ class DdsPublisher:
 
 
 class _Reading:
-    """Messages taken in a thread of their own."""
+    """A thread that takes the messages of a reader."""
 
     def __init__(
         self, participant: domain.DomainParticipant, reader: sub.DataReader[Any], receive: Receive
@@ -221,7 +221,7 @@ class _Reading:
 
 @cache
 def message_class(type_: str, kind: str = "msg") -> type[Any]:
-    """Return the class of `package/msg/Name`; what is said of services is who asks."""
+    """Return the class of `package/msg/Name`; for a service type, that of its header alone."""
     package, _, name = type_.split("/")
     fields = {"guid": types.uint64, "sequence": types.int64}
     if kind == "msg":
@@ -235,7 +235,7 @@ def message_class(type_: str, kind: str = "msg") -> type[Any]:
 
 
 def _of_bytes(class_: type[Any], data: bytes, /, **_: Any) -> Any:  # noqa: ANN401
-    """Return a message as bytes, of a class that serialises none otherwise."""
+    """Return a message of a class that passes bytes through."""
     sample = class_()
     sample.payload = data
     return sample
@@ -274,12 +274,12 @@ def _join() -> tuple[domain.Domain, domain.DomainParticipant]:
 
 
 def sockets() -> set[int]:
-    """Return the sockets that are open, where the system tells."""
+    """Return the open sockets of this process, on Linux."""
     return {int(link.name) for link in Path("/proc/self/fd").glob("*") if link.is_socket()}
 
 
 def _confine(numbers: set[int]) -> None:
-    """Let in nothing from beyond loopback: CycloneDDS listens on all addresses of the machine."""
+    """Bind sockets to the loopback device: CycloneDDS listens on all addresses."""
     for number in numbers:
         with socket.socket(fileno=os.dup(number)) as made, suppress(OSError):
             made.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo\0")
@@ -301,12 +301,12 @@ def _answer(
     writer: pub.DataWriter[Any],
     sample: Any,  # noqa: ANN401
 ) -> None:
-    """Answer a request; one that is damaged is left out."""
+    """Answer a request; ignore a damaged one."""
     coding, asked = sample.payload[_CODING], sample.payload[_ASKED]
     try:
         answer = service.call(coding + sample.payload[_ASKED.stop :], is_ros1=False)
     except GvoError as error:
-        _LOGGER.warning("%s: a request is left out: %s", service.name, error)
+        _LOGGER.warning("%s: a request is ignored: %s", service.name, error)
         return
     client = reader.get_matched_publication_data(sample.sample_info.publication_handle)
     _wait_for_reader(writer, client)
@@ -316,7 +316,7 @@ def _answer(
 
 
 def _wait_for_reader(writer: pub.DataWriter[Any], client: builtin.DcpsEndpoint | None) -> None:
-    """Wait until who asked is known to read the answers, which may take longer than to ask."""
+    """Wait until DDS knows the client's reader of answers, else the answer would be lost."""
     end_s = time.monotonic() + _ANSWERED_WITHIN_S
     while client is not None and time.monotonic() < end_s:
         readers = map(writer.get_matched_subscription_data, writer.matched_sub)

@@ -1,6 +1,6 @@
 """A live view in Foxglove: a WebSocket server of the Foxglove SDK, beside any input.
 
-It needs foxglove-sdk (the extra `foxglove`); who imports this module without it is told so.
+It needs foxglove-sdk (the extra `foxglove`).
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ except ImportError as error:
     raise missing_extra("--foxglove needs foxglove-sdk", "foxglove") from error
 
 DEFAULT_PORT = 8765
-"""Where Foxglove looks."""
+"""The port that Foxglove proposes."""
 
 _ENCODING, _SCHEMA_ENCODING = "cdr", "ros2msg"
-# Messages that wait for a client; of a slower one the oldest are dropped.
+# Messages that may wait for a client; then the oldest are dropped.
 _N_WAITING = 256
-# CDR has a byte for a message without fields, which not all clients send.
+# CDR has a byte for a message without fields; not all clients send it.
 _N_BYTES_EMPTY = 5
 _PATIENCE_S = 2.0
 _NULL = "null"
@@ -45,20 +45,20 @@ class Foxglove:
     Parameters
     ----------
     host : str
-        Address to listen on; 0.0.0.0 lets everyone on the network see and steer the run.
+        Address to listen on; with 0.0.0.0 everyone on the network can see and control the run.
     port : int
-        0 takes a free one.
+        0 takes a free port.
 
     Raises
     ------
     ConfigurationError
-        When the port is taken, or the address is none of this machine.
+        If the port is taken, or the address does not belong to this machine.
     """
 
     is_ros1 = False
 
     def __init__(self, *, host: str = "127.0.0.1", port: int = DEFAULT_PORT) -> None:
-        # What clients send wrongly is told to them, not to the terminal.
+        # Errors of clients are sent to them, not printed.
         logging.getLogger("foxglove").addHandler(logging.NullHandler())
         self._host = host
         self._context = foxglove.Context()
@@ -92,7 +92,7 @@ class Foxglove:
         return f"ws://{f'[{host}]' if ':' in host else host}:{self._server.port}"
 
     def advertise(self, topic: str, type_: str, *, is_latched: bool = False) -> Publisher:
-        """Open a channel for CDR messages, described as ROS 2 does."""
+        """Open a channel for CDR messages with a schema of ROS 2."""
         schema = _schema(type_, type_)
         channel = foxglove.Channel(
             topic, schema=schema, message_encoding=_ENCODING, context=self._context
@@ -102,7 +102,7 @@ class Foxglove:
         return publisher
 
     def serve(self, service: Service) -> None:
-        """Answer the calls of a service; what is no request of it is told to the client."""
+        """Answer the calls of a service; the client gets an error for a damaged request."""
         type_ = service.type
         type_.register(is_ros1=False)
         request, response = (
@@ -117,16 +117,16 @@ class Foxglove:
         self._server.add_services([foxglove.Service(service.name, schema=schema, handler=answer)])
 
     def offer(self, parameters: Parameters) -> None:
-        """Show parameters, and let clients set them; an empty one is the text null."""
+        """Let clients see and set parameters; one that is None appears as the text null."""
         self._listener.parameters = parameters
         parameters.follow(lambda config: self._changed.set())
 
     def _tell(self) -> None:
-        """Tell clients of changes.
+        """Send all values to the clients after each change, by connecting as a client itself.
 
-        `publish_parameter_values` of the SDK (0.30) is not called: it waits, holding Python's
-        lock, for a lock under which a client's subscription waits for Python's. A client that sets
-        nothing makes the server publish all values, and holds no lock of Python's meanwhile.
+        The SDK's own `publish_parameter_values` (0.30) can deadlock: it waits for a lock while it
+        holds Python's, and a subscription takes the two in the other order. After a client's
+        request that sets nothing the server publishes all values, without that risk.
         """
         while self._changed.wait() and not self._is_closed:
             self._changed.clear()
@@ -143,7 +143,7 @@ class Foxglove:
         self._is_closed = True
         self._changed.set()
         self._teller.join(_PATIENCE_S)
-        # It waits, without end, for those who connected and said nothing.
+        # `stop` waits for ever for clients that connected and sent nothing.
         stopping = threading.Thread(target=self._server.stop, daemon=True)
         stopping.start()
         stopping.join(_PATIENCE_S)
@@ -168,15 +168,15 @@ class _Channel:
         self.channel.log(data, log_time=stamp_ns)
 
     def repeat(self) -> None:
-        """Send the last message again, where it is latched; those who have it, have it twice."""
+        """Send the last message of a latched channel again, for a new subscriber."""
         if self._last is not None:
             data, stamp_ns = self._last
-            # Not published: that would put it in the place of what another thread sends meanwhile.
+            # Not by `publish`, which would overwrite what another thread publishes meanwhile.
             self.channel.log(data, log_time=stamp_ns)
 
 
 class _Listener(ServerListener):
-    """What clients ask for, in threads of the server."""
+    """Answers requests of clients, in threads of the server."""
 
     server: WebSocketServer
     parameters: Parameters | None = None
@@ -196,7 +196,7 @@ class _Listener(ServerListener):
     def on_set_parameters(
         self, client: Client, parameters: list[foxglove.Parameter], request_id: str | None = None
     ) -> list[foxglove.Parameter]:
-        """Set them, all or none; return those that hold now."""
+        """Set all of them or none; return their values."""
         if self.parameters is None:
             return []
         try:
@@ -214,7 +214,7 @@ def _schema(name: str, type_: str) -> foxglove.Schema:
 
 
 def _values(config: Config, names: Sequence[str]) -> list[foxglove.Parameter]:
-    """Return the parameters of those names; of no names, all."""
+    """Return the parameters of these names, or all if there are no names."""
     values = values_by_name(config)
     known = {name: _NULL if value is None else value for name, value in values.items()}
     chosen = [name for name in names if name in known] or ([] if names else known)

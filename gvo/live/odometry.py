@@ -1,4 +1,4 @@
-"""A run over images as they come: a queue of pairs between receiving and tracking."""
+"""Odometry over images as they arrive: a receiving thread, a queue, and the tracking."""
 
 from __future__ import annotations
 
@@ -36,61 +36,61 @@ if TYPE_CHECKING:
     from gvo.viz.view.live import LivePlayer
 
 _OnProgress: TypeAlias = Callable[[Progress], None]
-# Frames that are tied to one another before any is dropped, and what waits for them at most.
+# Frames that must be tracked before any pair is dropped, and how many pairs may wait until then.
 _N_TIED = 2
 _MAX_BEFORE_TIED = 300
-# Of as many frames, one in twenty may take longer than the slowest.
+# The lag is predicted by the slowest of the last twenty frames.
 _N_TIMED = 20
 _N_WARMING = 3
-# Stamps that go back by more are those of another run: a clock was set, or a bag begins again.
+# Stamps that go back by more begin a new run: a clock was set, or a bag is played again.
 _BACK_NS = 1_000_000_000
 _PATIENCE_S = 60.0
 
 
 class LiveRun(NamedTuple):
-    """A stretch of images, and what was written of it."""
+    """One run of a live session: its folder and its result."""
 
     folder: Path
     result: RunResult
 
 
 class LiveOdometry:
-    """Odometry over images as they come, with the outputs of a run.
+    """Track images as they arrive, send the poses, and write what a run writes.
 
-    Pairs are made in a thread that receives, and wait; decoding and odometry take them one by one
-    and look at none ahead. Where nothing is dropped the poses are those of `run_recording`, bit
-    for bit. Where the stamps go back, and where it is reset, a new run begins.
+    A thread receives images and pairs them; the pairs wait in a queue until they are tracked. If
+    no pair is dropped, the poses are bit for bit those of `run_recording` over the same images. A
+    new run begins when the stamps go back and after a reset.
 
     Parameters
     ----------
     source : Source
-        Whose `images` come as they are taken: `TopicSource`, `StandardInput`, `Device`.
+        Yields images as they are taken: `TopicSource`, `StandardInput` or `Device`.
     config : Config, optional
     sinks : sequence of Sink
-        Networks and viewers that poses are sent to. They are offered the parameters and the
+        Networks and viewers to send poses to. They can change the parameters and call the
         services `/gvo/reset`, `/gvo/save` (Trigger) and `/gvo/set_pose` (SetPose).
     base_frame : BaseFrame, optional
-        Whose poses are written; with a name, and tf from it to the camera, those of REP 105 are
-        `WORLD -> odom -> NAME`. The camera's where omitted.
+        The frame whose poses are written; the camera's if omitted. If tf connects a named frame
+        with the camera, the frames sent are `WORLD -> odom -> NAME` as of REP 105.
     world : str
-        The fixed frame of what is sent.
+        Name of the fixed frame of what is sent.
     with_tf : bool
         Send transforms.
     max_waiting : int
-        Pairs that wait at most; the oldest is dropped for one more.
+        Pairs that may wait; when one more comes, the oldest is dropped.
     max_lag_s : float, optional
-        Pairs whose poses would come later are dropped, but for the newest.
+        Drop pairs whose poses would be later than this, seconds; never the newest pair.
     say : callable
-        Is told, in a line, what happens to the images.
+        Gets a line of text when something happens to the images.
 
     Attributes
     ----------
     arrivals : Arrivals
-        How images come, and how long their poses take.
+        Rates of the images, and how long their poses take.
     parameters : Parameters
-        Changed by sinks and viewers.
+        Sinks and viewers change them.
     viewer : LivePlayer or None
-        Is shown each frame, see `gvo.viz.view.serve`.
+        Gets each frame; see `gvo.viz.view.serve`.
     """
 
     def __init__(
@@ -144,10 +144,10 @@ class LiveOdometry:
         force: bool = False,
         on_progress: _OnProgress = lambda _: None,
     ) -> list[LiveRun]:
-        """Track until the images end, or `stop` is called; then write what a run writes.
+        """Track until the images end or `stop` is called, then complete the run's files.
 
-        Parameters are those of `run_recording`, and so are the errors. A further run is written
-        beside the first: into the first free one of `OUT-2`, `OUT-3`, ..., and so are its files.
+        Parameters and errors are those of `run_recording`. A second run goes into `OUT-2`, or the
+        first free one of `OUT-3`, ...; so does its bag.
 
         Returns
         -------
@@ -173,9 +173,9 @@ class LiveOdometry:
         return [LiveRun(folder, drawn(result, folder)) for folder, result in runs]
 
     def stop(self) -> None:
-        """Take no more images; what waits is tracked. May be called by another thread."""
+        """Take no more images, but track the pairs that wait. Any thread may call it."""
         self._is_stopped = True
-        # Where the images can be ended, the pair that was made last comes too.
+        # A source with `close` ends its images, so that the last pair is completed and tracked.
         getattr(self._source, "close", self._waiting.close)()
 
     @property
@@ -214,7 +214,7 @@ class LiveOdometry:
         return LiveRun(folder, result)
 
     def _start(self, loop: RunLoop, save: Callable[[], None]) -> list[LiveMessages]:
-        """Take the loop of a run before its first frame; return where its poses go first."""
+        """Note the loop of a run that begins; return the output that sends its poses."""
         base_frame = self._base_frame
         frames = name_frames(
             *(loop.source, base_frame),
@@ -278,9 +278,9 @@ class LiveOdometry:
 
 
 class Stretches:
-    """Cuts images where their stamps go back, and where it is told to.
+    """Splits a stream of images into runs: where stamps go back, and after `cut`.
 
-    An image that alone is behind, by more than a second, is late and cuts nothing.
+    Two images in a row must be more than a second behind; a single one is only late.
 
     Attributes
     ----------
@@ -298,7 +298,7 @@ class Stretches:
         self.reason = ""
 
     def cut(self) -> None:
-        """End the stretch with the next image; may be called by another thread."""
+        """End the stretch before the next image. Any thread may call it."""
         self._is_cut = True
 
     def next_stretch(self) -> Iterator[StampedImage]:
@@ -333,7 +333,7 @@ class Stretches:
 
 
 def _warm(camera: StereoCamera | PinholeCamera, config: Config) -> None:
-    """Track noise, so that what is loaded and allocated once does not delay the first frames."""
+    """Track random images, so that loading and first allocations do not delay real ones."""
     odometry, rng = Odometry(camera, config), np.random.default_rng(0)
     for stamp_ns in range(_N_WARMING):
         shape = 2, camera.height, camera.width
@@ -346,19 +346,18 @@ def _warm(camera: StereoCamera | PinholeCamera, config: Config) -> None:
 
 
 class WaitingPairs:
-    """Pairs of images in the order they came; where tracking falls behind, the oldest are dropped.
+    """A queue of image pairs that drops the oldest when tracking falls behind.
 
-    A pair that is dropped leaves a faulty frame with the reason, so that nothing is lost without
-    a word. Nothing is dropped before two frames are tied: the motion until then is measured by
-    nobody else.
+    In place of a dropped pair the queue gives a faulty frame with the reason. It drops nothing
+    until two frames are tracked, since no later frame could measure the motion before.
 
     Parameters
     ----------
     max_waiting : int
-        Pairs that wait; the oldest is dropped for one more.
+        Pairs that may wait; when one more comes, the oldest is dropped.
     max_lag_s : float or None
-        A pair is dropped if its pose would come later after it, were tracking to take as long as
-        with the slowest of the last twenty; the newest never is. None: as late as may be.
+        Drop a pair whose pose would be later than this, seconds, if tracking took as long as the
+        slowest of the last twenty; never the newest pair. None: no limit.
 
     Attributes
     ----------
@@ -387,7 +386,7 @@ class WaitingPairs:
         self.on_pair: Callable[[int], None] = lambda _: None
 
     def put(self, item: Paired) -> None:
-        """Add a pair, or a frame without one; called by the thread that receives."""
+        """Add a pair or a faulty frame; the receiving thread calls it."""
         with self._changed:
             self._items.append(item)
             if not isinstance(item, FaultyFrame):
@@ -400,31 +399,31 @@ class WaitingPairs:
             self._changed.notify()
 
     def do(self, action: Callable[[], object]) -> None:
-        """Call something in the thread that takes, before it takes the next pair."""
+        """Have the tracking thread call `action` before it takes the next pair."""
         with self._changed:
             self._actions.append(action)
             self._changed.notify()
 
     def close(self, fault: GvoError | None = None) -> None:
-        """Take nothing more: what waits is given out, then the fault, if any."""
+        """Accept no more pairs; `take` gives those that wait, then raises `fault`, if any."""
         with self._changed:
             self._is_closed = True
             self._fault = self._fault or fault
             self._changed.notify()
 
     def note(self, progress: Progress) -> None:
-        """Note how many frames are tracked."""
+        """Note how many frames are tracked, and how long the last one took."""
         self._is_tied = progress.n_tracked >= _N_TIED
         if self._taken_s is not None:
             self._tracking_s.append(time.perf_counter() - self._taken_s)
 
     def take(self) -> Paired | None:
-        """Return the oldest one, waiting for it; None after the end.
+        """Wait for the oldest pair or faulty frame and return it; None after the end.
 
         Raises
         ------
         GvoError
-            That ended the stream.
+            The fault given to `close`.
         """
         while True:
             start_s = time.perf_counter()
@@ -437,7 +436,7 @@ class WaitingPairs:
             action()
 
     def take_waited_s(self) -> float:
-        """Return how long `take` has waited since the last call, seconds."""
+        """Return how long `take` has waited since this was last called, seconds."""
         waited_s, self._waited_s = self._waited_s, 0.0
         return waited_s
 
@@ -462,7 +461,7 @@ class WaitingPairs:
             return item
 
     def through(self, items: Iterable[Paired]) -> Iterator[Paired]:
-        """Receive items in a thread of their own, and yield what is taken here."""
+        """Receive items in another thread, and yield what `take` returns."""
         receiver = threading.Thread(target=self._receive, args=(items,), daemon=True)
         receiver.start()
         while (item := self.take()) is not None:
@@ -480,7 +479,7 @@ class WaitingPairs:
             self.close()  # whatever happened, nobody waits for more
 
     def _drop_oldest(self, limit: int) -> None:
-        """Replace the oldest pair by a faulty frame; those before it are faulty already."""
+        """Replace the oldest pair by a faulty frame."""
         for index, item in enumerate(self._items):
             if not isinstance(item, FaultyFrame):
                 self._items[index] = self._dropped(item, f"{limit} pairs wait (--queue)")

@@ -1,4 +1,4 @@
-"""What a running camera gives, sent to networks and viewers; and how its images come."""
+"""Poses of a running camera sent to networks and viewers, and the state of its images."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Opt
 
 _EVERY_S: Final = 1.0
 _SILENT_S: Final = 3.0
-# Over which rates and latencies are told.
+# Images and poses over which rates and latencies are computed.
 _N_RECENT: Final = 50
-# Pairs that may wait for their pose at once, and more.
+# Pairs whose arrival is remembered until their pose is sent.
 _N_WAITING: Final = 1000
 
 
 class LiveMessages:
-    """Sends the results of a run, in the world that was set last.
+    """Sends the results of a run, in the world chosen by the last `set_pose`.
 
     Parameters
     ----------
@@ -53,9 +53,9 @@ class LiveMessages:
         self._T_world_base = np.eye(4)
 
     def set_pose(self, T_world_base: FloatArray) -> None:
-        """Choose the world so that the newest pose is this one, shape (4, 4), metres.
+        """Move the world so that the newest pose becomes this one, shape (4, 4), metres.
 
-        The paths begin anew; the pose in `odom` goes on without a jump.
+        The paths begin anew. Poses in `odom` do not jump.
         """
         self._T_set_world = T_world_base @ se3.invert(self._T_world_base)
         for output in self._outputs:
@@ -70,18 +70,18 @@ class LiveMessages:
         self._on_sent(frame.stamp_ns)
 
     def add_faulty(self, frame: FaultyFrame) -> None:
-        """Tell that a frame has no pose."""
+        """Send the reason why a frame has no pose."""
         for output in self._outputs:
             output.add_faulty(frame)
 
     def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
-        """Send smoothed poses that are final."""
+        """Send smoothed poses that will not change any more."""
         placed = self._placed(estimates)
         for output in self._outputs:
             output.add_smoothed(placed)
 
     def add_optimum(self, optimum: Optimum) -> None:
-        """Send the global poses at the end, and the whole paths."""
+        """Send the global poses and the whole paths, at the end of a run."""
         placed = replace(optimum, estimates=self._placed(optimum.estimates))
         for output in self._outputs:
             output.add_optimum(placed)
@@ -101,25 +101,25 @@ class LiveMessages:
 
 
 class Arrivals(AbstractContextManager["Arrivals"]):
-    """Watches how images come and how long their poses take, and says when none come.
+    """Measures rates of images and latencies of poses, and says when images stop coming.
 
     Parameters
     ----------
     info : RecordingInfo
         Of the camera.
     topics : sequence of str
-        Where the images of both streams come from, for messages.
+        Names of both image streams, for messages.
     writers : sequence of NetworkWriter
-        Are sent the state each second, as `/diagnostics`.
+        Get the state each second, on `/diagnostics`.
     say : callable
-        Is told, in a line, when the state changes.
+        Gets a line of text when the state changes.
     n_dropped : callable
         Returns how many frames were dropped.
 
     Attributes
     ----------
     latencies_ms : deque of float
-        Of the newest frames, from the last image of a pair to its pose, milliseconds.
+        Times from the second image of a pair to its pose, for the newest frames, milliseconds.
     """
 
     def __init__(
@@ -151,7 +151,7 @@ class Arrivals(AbstractContextManager["Arrivals"]):
         self._thread.join()
 
     def watch(self, images: Iterable[StampedImage]) -> Iterator[StampedImage]:
-        """Yield the images, and note when each came."""
+        """Yield the images and note when each arrived."""
         for image in images:
             self._times_s[image.stream].append(time.monotonic())
             self._newest_ns = max(self._newest_ns, image.stamp_ns)
@@ -162,7 +162,7 @@ class Arrivals(AbstractContextManager["Arrivals"]):
         self._waiting_s.append((stamp_ns, time.monotonic()))
 
     def note_sent(self, stamp_ns: int) -> None:
-        """Note that the pose of a pair was sent; those before it have none."""
+        """Note that the pose of a pair was sent; earlier pairs were dropped."""
         while self._waiting_s:
             pair_ns, came_s = self._waiting_s.popleft()
             if pair_ns == stamp_ns:
@@ -170,7 +170,7 @@ class Arrivals(AbstractContextManager["Arrivals"]):
                 return
 
     def state(self) -> str:
-        """Return what is wrong with the images in a line; empty where they come."""
+        """Return a line that says which images are missing; empty if both streams arrive."""
         now_s = time.monotonic()
         silent_s = [now_s - (times[-1] if times else self._started_s) for times in self._times_s]
         silent = int(silent_s[1] > silent_s[0])

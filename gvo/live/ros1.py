@@ -1,7 +1,7 @@
 """ROS 1 by rospy: topics, services, and parameters as dynamic_reconfigure has them.
 
-Messages stay bytes: rospy is given classes with the names and sums of their types and nothing else,
-so that neither packages of messages nor cv_bridge are needed.
+Messages stay bytes: rospy gets classes that have the name and MD5 sum of a type and pass bytes
+through, so that neither message packages nor cv_bridge are needed.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from gvo.io.bag.topics import Topic
 from gvo.live.transport import OnMessage, Parameters, Service, ServiceType
 
 _LOGGER = logging.getLogger(__name__)
-# Where Debian and Ubuntu have rospy. At the end of the path: before it, it shadows packages.
+# Where Debian and Ubuntu install rospy. Appended to the path, so that it shadows no package.
 _DEBIAN = "/usr/lib/python3/dist-packages"
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 _MASTER_TIMEOUT_S = 5.0
@@ -48,8 +48,7 @@ _READ_BYTES = 1 << 20
 class Ros1:
     """A node of ROS 1.
 
-    There is one in a process, and none after `close`: rospy has it so. Where the program made its
-    node already, it is taken.
+    rospy allows one node per process, and none after `close`. A node that exists is used.
 
     Parameters
     ----------
@@ -59,7 +58,7 @@ class Ros1:
     Raises
     ------
     ConfigurationError
-        When rospy is not installed, or no master answers.
+        If rospy is not installed, or no master answers.
     """
 
     name = "ROS 1"
@@ -85,13 +84,13 @@ class Ros1:
         rospy.core.add_preshutdown_hook(self._end)
 
     def topics(self) -> list[Topic]:
-        """Return what other nodes announce."""
+        """Return the topics that other nodes announce."""
         try:
             master = self._rospy.get_master()
             _, _, (published, _, _) = master.getSystemState()
             _, _, types = master.getTopicTypes()
         except (OSError, xmlrpc.client.Error, HTTPException) as error:
-            raise RecordingError(f"ROS 1: the master answers no more: {error}") from error
+            raise RecordingError(f"ROS 1: the master does not answer any more: {error}") from error
         others = {name for name, nodes in published if set(nodes) - {self._rospy.get_name()}}
         return [
             Topic(name=name, type=normalize_msgtype(type_), n_messages=1)
@@ -110,7 +109,7 @@ class Ros1:
         )
 
     def advertise(self, topic: str, type_: str, *, is_latched: bool = False) -> _Publisher:
-        """Open a topic for writing; `~name` is one of the node's own."""
+        """Open a topic for writing; `~name` is in the node's namespace."""
         message_class = _message_class(type_)
         publisher = self._rospy.Publisher(
             topic, message_class, latch=is_latched, queue_size=_N_QUEUED
@@ -119,7 +118,7 @@ class Ros1:
         return _Publisher(publisher, message_class, is_latched=is_latched)
 
     def serve(self, service: Service) -> None:
-        """Answer the calls of a service; `~name` is one of the node's own."""
+        """Answer the calls of a service; `~name` is in the node's namespace."""
         service_class = _service_class(service.type)
 
         def answer(request: Any) -> Any:  # noqa: ANN401 - of classes made at run time
@@ -131,7 +130,7 @@ class Ros1:
         self._rospy.Service(service.name, service_class, answer)
 
     def offer(self, parameters: Parameters) -> None:
-        """Let parameters be changed by rqt_reconfigure and dynparam."""
+        """Let rqt_reconfigure and dynparam change the parameters."""
         _Reconfigure(self, parameters, warn=self._rospy.logwarn)
 
     def close(self) -> None:
@@ -143,7 +142,7 @@ class Ros1:
         self._rospy.signal_shutdown("closed")
 
     def _end(self, reason: str) -> None:
-        """End the program as Ctrl-C does where the master ends the node: rosnode kill."""
+        """End the program as Ctrl-C does when the master ends the node (rosnode kill)."""
         if not self._is_closed:
             _LOGGER.warning("ROS 1: the master ends the node: %s", reason)
             signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
@@ -155,12 +154,12 @@ class _Publisher:
         self._is_latched = is_latched
 
     def publish(self, data: bytes, stamp_ns: int) -> None:
-        """Send a message; the oldest one that waits for a slow node is dropped for it."""
+        """Send a message; for a slow node the oldest that waits is dropped."""
         self._publisher.publish(self._message_class(data))
 
     @property
     def is_heard(self) -> bool:
-        """Whether anybody listens, or may come late and be given the last message."""
+        """Whether anybody listens; always true for a latched topic."""
         return self._is_latched or self._publisher.get_num_connections() > 0
 
 
@@ -186,7 +185,7 @@ def _import_rospy() -> Any:  # noqa: ANN401 - has no types
 
 
 def _find_master() -> str:
-    """Return the address of the master; rospy would wait for one for ever."""
+    """Return the address of the master; without one rospy would wait for ever."""
     rosgraph = import_module("rosgraph")
     uri = str(rosgraph.get_master_uri())
     before = socket.getdefaulttimeout()
@@ -242,7 +241,7 @@ def _service_class(service: ServiceType) -> Any:  # noqa: ANN401 - made here
 
 
 def _hashed(definition: str) -> str:
-    """Return what the sum of a service is made of: sums in place of the names of messages."""
+    """Return the text that the MD5 sum of a service is of: sums in place of message names."""
     lines = []
     for type_, field in (line.split() for line in definition.splitlines()):
         is_message = "/" in type_
@@ -258,7 +257,7 @@ _RECONFIGURE: Final = ServiceType(
     response="dynamic_reconfigure/Config config",
 )
 _TYPES: Final = {bool: "bool", int: "int", float: "double", str: "str"}
-# Of each kind of parameter the type, and the bounds where there are none.
+# Type of each kind of parameter, and the bounds to show where it has none.
 _KINDS: Final[dict[str, tuple[Any, Any, Any]]] = {
     "switch": (bool, False, True),
     "choice": (str, "", ""),
@@ -271,8 +270,8 @@ _NULL = "__null"
 class _Reconfigure:
     """A server of dynamic_reconfigure.
 
-    A parameter is called `section__key`, in a group of its section. One that may be null has a
-    switch `section__key__null` beside it; a number that is given turns it off.
+    A parameter is named `section__key`, in the group of its section. One that may be null has a
+    switch `section__key__null` beside it; giving a number turns the switch off.
     """
 
     def __init__(self, node: Ros1, parameters: Parameters, *, warn: Callable[[str], None]) -> None:
@@ -300,7 +299,7 @@ class _Reconfigure:
         return {"config": self._state(self._parameters.config)}
 
     def _wanted(self, config: Any) -> dict[str, Any]:  # noqa: ANN401 - made at run time
-        """Return what is to be set, by `section.key`."""
+        """Return the values that a request sets, by `section.key`."""
         lists = [getattr(config, f"{type_}s") for type_ in _TYPES.values()]
         given = {item.name: item.value for item in chain(*lists)}
         shown = self._values(self._parameters.config)
@@ -364,7 +363,7 @@ def _known_parameters() -> dict[str, Parameter]:
 
 
 def _enumeration(parameter: Parameter) -> str:
-    """Return the choices, if any, as dynamic_reconfigure has them: as Python writes them."""
+    """Return the choices, if any, as dynamic_reconfigure wants them: the repr of a dict."""
     choices = [
         {"name": choice, "value": choice, "type": "str", "description": choice}
         for choice in parameter.choices

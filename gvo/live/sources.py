@@ -1,13 +1,13 @@
-"""Cameras that are running: images from another program through a pipe, or from a device.
+"""Running cameras: images on standard input, or from a device.
 
-Through a pipe each image is a line of JSON, then the bytes of its pixels, row by row:
+On standard input each image is a line of JSON, then the bytes of its pixels, row by row:
 
     {"stream": "left", "stamp_ns": 1700000000000000000, "encoding": "mono8", "width": 640,
      "height": 480}
 
 (on one line). `stream` is left or right, or color or depth; `encoding` is one of ROS. A compressed
-image has `"format": "png"` (or jpeg, ...) and its `"size"` in bytes in place of `encoding`, `width`
-and `height`.
+image has `"format": "png"` (or jpeg, ...) and `"size"` (bytes) in place of `encoding`, `width` and
+`height`.
 """
 
 from __future__ import annotations
@@ -49,18 +49,18 @@ _N_SHOWN = 80
 
 
 class StandardInput:
-    """A camera whose images another program writes into a pipe.
+    """A camera whose images another program writes to standard input.
 
     Parameters
     ----------
     stream : binary file
         Read to its end.
     info : RecordingInfo
-        Of the camera, as `gvo.Rig` has it.
+        Of the camera: `gvo.Rig(...).info`.
     config : Config, optional
-        `images`, and `depth.scale` in place of the calibration's.
+        Of which `images` and `depth.scale` are used.
     depth_scale : float, optional
-        Counts per metre; 1000 where omitted.
+        Counts per metre, if `config` has none; 1000 if omitted.
     """
 
     def __init__(
@@ -77,12 +77,12 @@ class StandardInput:
         self._grey_range = GreyRange(black=config.images.black, white=config.images.white)
 
     def images(self) -> Iterator[StampedImage]:
-        """Yield the images as they come.
+        """Yield the images as they arrive.
 
         Raises
         ------
         RecordingError
-            For a line that is no header, or an end in the middle of an image.
+            If a line is not a header, or the input ends within an image.
         """
         while line := self._stream.readline(_MAX_LINE):
             if not line.strip():
@@ -96,7 +96,7 @@ class StandardInput:
             )
 
     def ground_truth(self) -> Trajectory | None:
-        """Return None: a pipe holds no true poses."""
+        """Return None."""
         return None
 
     def _stream_of(self, header: dict[str, Any]) -> int:
@@ -108,7 +108,7 @@ class StandardInput:
         return _STREAMS[str(name)]
 
     def _loader(self, header: dict[str, Any], *, is_depth: bool) -> Callable[[], NDArray[Any]]:
-        """Read the bytes of an image, and return what decodes them."""
+        """Read the bytes of an image; return the function that decodes them."""
         if "format" in header:
             size = _whole(header, "size", lowest=0, highest=_MAX_COMPRESSED)
             packed = _message(COMPRESSED_TYPE, format=str(header["format"]), data=self._read(size))
@@ -165,21 +165,21 @@ def _whole(header: dict[str, Any], name: str, *, lowest: int, highest: int) -> i
 
 
 class Device:
-    """A stereo camera behind `cv2.VideoCapture`.
+    """A stereo camera read by `cv2.VideoCapture`.
 
-    Images are stamped when they were grabbed; those of a film by its own clock.
+    An image's stamp is the time when it was grabbed; in a video file, the file's own time.
 
     Parameters
     ----------
     names : sequence of str
-        A number, a device or a file: one that shows left and right side by side, or two.
+        One or two device numbers or video files; a single one shows left and right side by side.
     info : RecordingInfo
-        Of a stereo camera, as `gvo.Rig` has it.
+        Of a stereo camera: `gvo.Rig(...).info`.
 
     Raises
     ------
     RecordingError
-        When one cannot be opened.
+        If one cannot be opened.
     """
 
     def __init__(self, names: Sequence[str], info: RecordingInfo) -> None:
@@ -192,7 +192,7 @@ class Device:
         self._captures = [_opened(name) for name in names]
 
     def images(self) -> Iterator[StampedImage]:
-        """Yield left and right images as they are grabbed, until a device gives no more."""
+        """Yield left and right images as they are grabbed, until a device ends."""
         first_ns = time.time_ns()
         try:
             while all(capture.grab() for capture in self._captures):
@@ -205,11 +205,11 @@ class Device:
                 capture.release()
 
     def ground_truth(self) -> Trajectory | None:
-        """Return None: a camera knows no true poses."""
+        """Return None."""
         return None
 
     def _stamp_ns(self, first_ns: int) -> int:
-        """Return the time of a film, else that of now."""
+        """Return the time within a video file, or the time of the clock."""
         capture = self._captures[0]
         if capture.get(cv2.CAP_PROP_FRAME_COUNT) > 0:
             return first_ns + round(capture.get(cv2.CAP_PROP_POS_MSEC) * _MILLISECOND_NS)

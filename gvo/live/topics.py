@@ -29,9 +29,9 @@ from gvo.live.transport import Transport
 _SMALL = (CAMERA_INFO_TYPE, *TF_TYPES)
 _LOGGER = logging.getLogger(__name__)
 _OWN = "/gvo/"
-# Messages of each topic that are kept: what a calibration or a mount is read from.
+# Messages kept of each CameraInfo and tf topic, to read the calibration and the mount from.
 _N_KEPT: Final = 100
-# Images that wait to be paired; pairing is quick, and pairs have a queue of their own.
+# Images that may wait to be paired. Pairing is quick; pairs have a queue of their own.
 _N_WAITING: Final = 300
 _PAUSE_S = 0.2
 _SAID_AFTER = 5
@@ -39,9 +39,9 @@ _Found = TypeVar("_Found")
 
 
 class NetworkReader:
-    """What came of the topics of a network so far, and the images as they come.
+    """Reads the topics of a network as `BagReader` reads those of a bag.
 
-    `CameraInfo` and transforms are received from the first `refresh` on, images from `begin` on.
+    It receives `CameraInfo` and transforms from the first `refresh` on, images from `begin` on.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class NetworkReader:
     Attributes
     ----------
     topics : list of Topic
-        Those announced, without those of gvo itself.
+        Those that others announce.
     """
 
     damage = ""
@@ -66,7 +66,7 @@ class NetworkReader:
         self._is_closed = False
 
     def refresh(self) -> bool:
-        """List the topics anew; tell whether they are those of the last time."""
+        """List the topics again; tell whether they are still the same."""
         before = self.topics
         topics = [each for each in self.transport.topics() if not each.name.startswith(_OWN)]
         self.topics = sorted(topics, key=lambda topic: topic.name)
@@ -82,12 +82,12 @@ class NetworkReader:
                 self._subscribe(topic)
 
     def messages(self, names: Collection[str]) -> Iterator[BagMessage]:
-        """Yield what came of some topics, up to a hundred messages of each; of images the first.
+        """Yield messages received so far: up to a hundred of each topic, one of image topics.
 
         Raises
         ------
         RecordingError
-            Where none came of a topic, unless it is of transforms.
+            If nothing came on a topic that is not tf.
         """
         types = {topic.name: topic.type for topic in self.topics}
         for name in names:
@@ -98,7 +98,7 @@ class NetworkReader:
         yield from sorted(kept, key=lambda message: message.log_time_ns)
 
     def images(self) -> Iterator[BagMessage]:
-        """Yield images as they come, until it is closed."""
+        """Yield images as they arrive, until `close`."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._images or self._is_closed)
@@ -108,7 +108,7 @@ class NetworkReader:
             yield message
 
     def close(self) -> None:
-        """Give out no more than came so far."""
+        """End the images after those received so far."""
         with self._changed:
             self._is_closed = True
             self._changed.notify_all()
@@ -133,13 +133,13 @@ class NetworkReader:
             if len(self._images) > _N_WAITING:
                 self._images.popleft()
                 if not self._is_crowded:
-                    _LOGGER.warning("images are given up: more than %d wait", _N_WAITING)
+                    _LOGGER.warning("images are dropped: more than %d wait", _N_WAITING)
                 self._is_crowded = True
             self._changed.notify_all()
 
 
 class TopicSource(BagSource):
-    """A stereo or RGB-D camera that sends its images in a network, found as in a bag.
+    """A stereo or RGB-D camera in a network, found by its topics as in a bag.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ class TopicSource(BagSource):
     Raises
     ------
     RecordingError, CalibrationError
-        As long as what is needed has not come; see `wait_for`.
+        While the images or the calibration are still missing; see `wait_for`.
     """
 
     def __init__(
@@ -170,13 +170,13 @@ class TopicSource(BagSource):
         self._open(reader, reader.transport.name, topics, calibration, config)
 
     def images(self) -> Iterator[StampedImage]:
-        """Yield the images as they come, until `close`."""
+        """Yield images as they arrive, until `close`."""
         for message in self._network.images():
             if message.topic.name in self.image_topics:
                 yield self._stamped(message, self.image_topics.index(message.topic.name))
 
     def transforms(self, frames: Collection[str] | None = None) -> TfBuffer:
-        """Return the transforms that came so far, all of them."""
+        """Return all transforms received so far."""
         return read_tf(self._network)
 
     def close(self) -> None:
@@ -192,21 +192,21 @@ class TopicSource(BagSource):
 def wait_for(
     make: Callable[[], _Found], say: Callable[[str], None], is_ended: threading.Event
 ) -> _Found | None:
-    """Try until what is needed has come.
+    """Call `make` again and again until it succeeds.
 
     Parameters
     ----------
     make : callable
-        Makes it, or raises what is missing.
+        Raises a `RecordingError` or `CalibrationError` that says what is missing.
     say : callable
-        Is told what is missing, in a line, when it lasts, and when it changes.
+        Gets a line that says what is missing, after a second and when it changes.
     is_ended : threading.Event
-        Set by whoever gives up.
+        Set it to give up.
 
     Returns
     -------
     object or None
-        None where it was given up.
+        What `make` returned; None after giving up.
     """
     said, n_tries = "", 0
     while not is_ended.is_set():

@@ -1,6 +1,6 @@
-"""What a network of topics must be able to do, and messages written into it.
+"""What `gvo live` needs of a network of topics, of services and of parameters.
 
-Messages are bytes: rosbags makes and reads them, so that no package of messages is needed.
+Messages are bytes: rosbags serialises them, so that no message packages of ROS are needed.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ from gvo.io.bag.topics import Topic
 from gvo.io.convert.bag_messages import MessageWriter
 
 OnMessage: TypeAlias = Callable[[bytes, int], None]
-"""Takes the bytes of a message, and when it came in nanoseconds."""
+"""Gets the bytes of a message, and the time when it came, nanoseconds."""
 
 
 class Publisher(Protocol):
     """A topic that messages are written to."""
 
     def publish(self, data: bytes, stamp_ns: int) -> None:
-        """Send a message of that stamp; called by any thread."""
+        """Send a message. Any thread may call it."""
 
     @property
     def is_heard(self) -> bool:
-        """Whether anybody listens; what is dear to make is not made otherwise."""
+        """Whether anybody listens; clouds and pictures are not made otherwise."""
 
 
 class Sink(Protocol):
-    """A network or a viewer that takes messages, and may ask for something.
+    """A network or viewer that gets messages, calls services and changes parameters.
 
     Attributes
     ----------
     is_ros1 : bool
-        Messages are serialised the way of ROS 1, not as CDR.
+        Messages are serialised as in ROS 1, else as CDR.
     """
 
     is_ros1: bool
@@ -55,21 +55,21 @@ class Sink(Protocol):
         type_ : str
             `package/msg/Name`.
         is_latched : bool
-            Who comes late is given the last message.
+            Subscribers that come late get the last message.
         """
 
     def serve(self, service: Service) -> None:
         """Answer the calls of a service, in a thread of the transport."""
 
     def offer(self, parameters: Parameters) -> None:
-        """Let parameters be seen and changed in the way of the transport, if it has one."""
+        """Let others see and change the parameters, if the network has a way to do so."""
 
     def close(self) -> None:
-        """Leave; nothing is sent or received any more."""
+        """Leave the network: send and receive nothing any more."""
 
 
 class Transport(Sink, Protocol):
-    """A network in which cameras send, too.
+    """A network that also has topics of cameras.
 
     Attributes
     ----------
@@ -80,31 +80,31 @@ class Transport(Sink, Protocol):
     name: str
 
     def topics(self) -> Sequence[Topic]:
-        """Return what others announce now, each with one message at least."""
+        """Return the topics of others; `n_messages` is 1, the true number being unknown."""
 
     def subscribe(self, topic: str, type_: str, callback: OnMessage) -> None:
-        """Receive the messages of a topic, those that are latched too.
+        """Receive the messages of a topic, also latched ones.
 
         Parameters
         ----------
         topic, type_ : str
             As `topics` has them.
         callback : callable
-            Takes the bytes of a message, and the time by the clock of the transport, nanoseconds
-            (simulated, where that is the clock). Called in a thread of the transport.
+            Gets the bytes of a message and the time of the network's clock, nanoseconds, which
+            may be simulated. Called in a thread of the transport.
         """
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServiceType:
-    """Names and definitions of a type of services, as of ROS 2.
+    """A service type as in ROS 2.
 
     Parameters
     ----------
     name : str
         `package/srv/Name`.
     request, response : str
-        What a `.srv` file has above and below its line.
+        The parts of a `.srv` file above and below its line of dashes.
     """
 
     name: str
@@ -113,16 +113,16 @@ class ServiceType:
 
     @property
     def request_type(self) -> str:
-        """Name of the message of a request."""
+        """Name of the request's message type."""
         return f"{self.name.replace('/srv/', '/msg/')}_Request"
 
     @property
     def response_type(self) -> str:
-        """Name of the message of an answer."""
+        """Name of the answer's message type."""
         return f"{self.name.replace('/srv/', '/msg/')}_Response"
 
     def register(self, *, is_ros1: bool) -> None:
-        """Make both messages known to rosbags."""
+        """Register both message types with rosbags."""
         store = typestore(is_ros1=is_ros1)
         for type_, text in (self.request_type, self.request), (self.response_type, self.response):
             if type_ not in store.fielddefs:
@@ -141,7 +141,7 @@ SET_POSE: Final = ServiceType(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Service:
-    """What is done when it is called.
+    """A service and the function that answers it.
 
     Parameters
     ----------
@@ -149,8 +149,7 @@ class Service:
         With its leading slash.
     type : ServiceType
     answer : callable
-        Takes the message of the request and returns the fields of the answer. Called by any
-        thread.
+        Gets the message of a request and returns the fields of the answer, in any thread.
     """
 
     name: str
@@ -158,12 +157,12 @@ class Service:
     answer: Callable[[Any], Mapping[str, Any]]
 
     def call(self, request: bytes, *, is_ros1: bool) -> bytes:
-        """Return the bytes of the answer.
+        """Answer a request; both are bytes.
 
         Raises
         ------
         RecordingError
-            When the bytes are no request.
+            If the request cannot be decoded.
         """
         self.type.register(is_ros1=is_ros1)
         message = decode(request, self.type.request_type, is_ros1=is_ros1)
@@ -173,21 +172,21 @@ class Service:
 
 
 def decode(data: bytes, type_: str, *, is_ros1: bool) -> Any:  # noqa: ANN401 - made at run time
-    """Return a message that came from a network.
+    """Decode a message that came from a network.
 
     Raises
     ------
     RecordingError
-        When the bytes are no message of the type.
+        If the bytes are not a message of the type.
     """
     topic = Topic(name=type_, type=type_, n_messages=1)
     return BagMessage(topic=topic, log_time_ns=0, data=data, is_ros1=is_ros1).decode()
 
 
 class Parameters:
-    """The configuration while it runs, changed from anywhere.
+    """The configuration of a running camera, which any thread may change.
 
-    What a parameter is called, its range and its meaning: `gvo.config.list_parameters`.
+    `gvo.config.list_parameters` has the names, ranges and meanings.
 
     Parameters
     ----------
@@ -201,11 +200,11 @@ class Parameters:
 
     @property
     def config(self) -> Config:
-        """The configuration as it was set last; the next frame has it."""
+        """The configuration of the next frame."""
         return self._config
 
     def follow(self, callback: Callable[[Config], None]) -> None:
-        """Call back after each change, in the thread that made it."""
+        """Call `callback` after each change, in the thread that made it."""
         self._followers.append(callback)
 
     def set(self, values: Mapping[str, object]) -> Config:
@@ -224,7 +223,7 @@ class Parameters:
         Raises
         ------
         ConfigurationError
-            When one does not exist or is out of its range; nothing is changed then.
+            If one does not exist or is out of range; then none is changed.
         """
         with self._lock:
             nested = self._config.model_dump()
@@ -257,12 +256,12 @@ class NetworkWriter(MessageWriter):
         self._publishers: dict[str, Publisher] = {}
 
     def announce(self, topics: Mapping[str, str]) -> None:
-        """Open topics, by name and type, before there is anything to write."""
+        """Open topics, by name and type, so that others find them before the first message."""
         for topic, type_ in topics.items():
             self._publisher(topic, type_, is_latched=topic == "/tf_static")
 
     def is_wanted(self, topic: str) -> bool:
-        """Tell whether anybody listens, or the topic is not open yet."""
+        """Tell whether anybody listens; also true if the topic is not open yet."""
         publisher = self._publishers.get(topic)
         return publisher is None or publisher.is_heard
 

@@ -25,7 +25,7 @@ from gvo.types import Edge, Estimate, FaultyFrame, FloatArray, Frame, FrameResul
 
 _LOGGER = logging.getLogger(__name__)
 
-# Over which the window is asked, once in each, how the camera moved.
+# Once per span the window gives the motion over it, to compare covariances with the truth.
 _SPAN_NS = 1_000_000_000
 _MOST_OFF_NS = 500_000_000
 _EDGE = np.dtype(
@@ -37,20 +37,20 @@ class Output(Protocol):
     """Writes a run as it goes; all poses are of the base frame."""
 
     def add_frame(self, frame: Any, result: FrameResult) -> None:  # noqa: ANN401
-        """Write what one frame gave, and the smoothed poses that are final with it."""
+        """Write the result of a frame, with the smoothed poses that became final."""
 
     def add_faulty(self, frame: FaultyFrame) -> None:
         """Write that a frame has no pose."""
 
     def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
-        """Write smoothed poses that are final."""
+        """Write smoothed poses that will not change any more."""
 
     def add_optimum(self, optimum: Optimum) -> None:
-        """Write, at the end, the poses that fit all measurements best, and the loops."""
+        """Write the global poses and the loops, at the end."""
 
 
 class FileOutput(Output, Protocol):
-    """An output to a file, which is complete when it is closed."""
+    """An output to a file, which `close` completes."""
 
     def close(self) -> None:
         """Complete the file; a second call does nothing."""
@@ -65,13 +65,11 @@ class RunLoop:
         The recording.
     config : Config
     base_frame : BaseFrame
-        Whose poses are written.
+        The frame whose poses are written.
     excerpt : Excerpt, optional
-        Which frames are read; all where omitted.
+        The frames to read; all if omitted.
     first_pose : callable, optional
         Returns T_world_base, shape (4, 4), of the first frame by its stamp.
-    items : iterable of StereoFrame, RgbdFrame or FaultyFrame, optional
-        The frames in another order than that of the recording.
     through : callable, optional
         See `gvo.frames`.
 
@@ -82,12 +80,12 @@ class RunLoop:
     statistics : RunStatistics
         Counts so far.
     output_faults : list of str
-        Why outputs were not written to their end.
+        Why outputs could not be written completely.
     take_waited_s : callable
-        Returns how long the last frame was waited for, seconds, which is no time of reading.
+        Returns how long reading waited for the last frame of a running camera, seconds.
     on_tracked : callable or None
-        Called after the outputs with each frame and what it gave, poses of the camera; with a
-        faulty one and None.
+        Called after the outputs with each frame and its result (poses of the camera), or with a
+        faulty frame and None.
     """
 
     def __init__(
@@ -98,13 +96,12 @@ class RunLoop:
         *,
         excerpt: Excerpt | None = None,
         first_pose: Callable[[int], FloatArray] | None = None,
-        items: Iterable[Frame | FaultyFrame] | None = None,
         through: Through | None = None,
     ) -> None:
         self.source, self.config, self.base_frame = source, config, base_frame
         self.statistics = RunStatistics()
         self.excerpt = excerpt or Excerpt()
-        self._first_pose, self._items, self._through = first_pose, items, through
+        self._first_pose, self._through = first_pose, through
         self._read_ms = 0.0
         self._first_ns: int | None = None
         self._previous_ns: int | None = None
@@ -118,33 +115,33 @@ class RunLoop:
 
     @property
     def window(self) -> SlidingWindow:
-        """The window of the odometry; to be read in `on_tracked`."""
+        """The window of the odometry, for `on_tracked` to read."""
         return self._odometry.window
 
     @property
     def edges(self) -> list[tuple[int, Edge]]:
-        """The stamp of a frame and its pose in one about 1 s before, by the window as it was then.
+        """Motions of the base frame over about 1 s as the window had them, about one a second.
 
-        About one each second; of the base frame.
+        Each is the stamp of a frame and the edge to it from a frame about 1 s earlier.
         """
         stamps_ns = enumerate(self._edges.stamps_ns)
         return [(stamp_ns, Edge(**self._edges.fields(k))) for k, stamp_ns in stamps_ns]
 
     @property
     def is_placed(self) -> bool:
-        """Tell whether an initial pose was asked for: the world is not that of the first frame."""
+        """Tell whether the first pose was given, so that it is not the identity."""
         return self.base_frame.is_placed or self._first_pose is not None
 
     def run(
         self, outputs: Iterable[Output], on_progress: Callable[[Progress], None] | None
     ) -> None:
-        """Track all frames; where the recording breaks off, note it and end.
+        """Track all frames; if the recording breaks off, note it and end.
 
         Parameters
         ----------
         outputs : iterable of Output
-            Get all poses, also those still in the window where the run is interrupted. One that
-            cannot write gets no more, unless it raises `OutputError`, which ends the run.
+            Get all poses; if the run is interrupted, also those still in the window. An output that
+            raises `OutputError` ends the run; one that raises another error gets no more poses.
         on_progress : callable, optional
             Called after each frame.
         """
@@ -176,7 +173,7 @@ class RunLoop:
         Returns
         -------
         Optimum or None
-            As of `optimum`; also None where GTSAM fails: `output_faults` says so.
+            As of `optimum`; also None if GTSAM fails, and then `output_faults` says so.
         """
         try:
             optimum = self.optimum()
@@ -188,12 +185,12 @@ class RunLoop:
         return optimum
 
     def optimum(self) -> Optimum | None:
-        """Return the optimum of all measurements so far, of the base frame.
+        """Return the optimum of all measurements so far, with poses of the base frame.
 
         Returns
         -------
         Optimum or None
-            None if it is not asked for.
+            None if `loops.enabled` is off or no frame has a pose.
 
         Raises
         ------
@@ -232,9 +229,7 @@ class RunLoop:
         return self.excerpt.n_expected(n_images, length_s=length_s or None)
 
     def _read(self) -> Iterator[Frame | FaultyFrame]:
-        items = self._items
-        if items is None:
-            items = frames(self.source, self.config, self.excerpt, through=self._through)
+        items = frames(self.source, self.config, self.excerpt, through=self._through)
         iterator = iter(items)
         while True:
             start = time.perf_counter()
@@ -249,7 +244,7 @@ class RunLoop:
             yield item
 
     def _take(self, item: Frame | FaultyFrame) -> None:
-        """Count a frame, and give the outputs its poses as those of the base frame."""
+        """Track a frame, count it, and give its poses of the base frame to the outputs."""
         if isinstance(item, FaultyFrame):
             self._take_faulty(item)
             return
@@ -277,7 +272,7 @@ class RunLoop:
                 self.output_faults.append(str(error))
 
     def _ask_window(self, stamp_ns: int) -> None:
-        """Keep the motion over the last second, where the last one kept is as old."""
+        """Once a second, keep the motion over the last second as the window has it."""
         if self._asked_ns is None:
             self._asked_ns = stamp_ns
         if stamp_ns - self._asked_ns < _SPAN_NS:
@@ -318,7 +313,7 @@ class RunLoop:
 
 
 def edge_over(window: SlidingWindow, stamp_ns: int, span_ns: int) -> Edge | None:
-    """Return the newest pose in one about a span older, with the covariance of both together.
+    """Return the edge to the newest pose from one about `span_ns` older.
 
     Parameters
     ----------
@@ -332,8 +327,8 @@ def edge_over(window: SlidingWindow, stamp_ns: int, span_ns: int) -> Edge | None
     Returns
     -------
     Edge or None
-        None where no pose of the window is so much older, up to half a second, or the newest could
-        not be put into it.
+        None if no pose of the window has that age within half a second, or if the newest pose is
+        not in the window.
     """
     if stamp_ns not in window:
         return None
@@ -345,7 +340,7 @@ def edge_over(window: SlidingWindow, stamp_ns: int, span_ns: int) -> Edge | None
 
 
 def motions_of_window(edges: Sequence[tuple[int, Edge]], *, name: str) -> Motions:
-    """Return edges as motions, to compare them with true ones.
+    """Return edges as motions, to be compared with the true ones.
 
     Parameters
     ----------

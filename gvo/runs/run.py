@@ -37,20 +37,21 @@ _LOGGER = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RunResult:
-    """What a run gave.
+    """The result of a run.
 
     Parameters
     ----------
     summary : dict
         As written to `summary.json`.
     evaluations : tuple of Evaluation
-        Of raw, causal, smoothed and global; empty where they were not compared.
+        Of raw, causal, smoothed and global poses; empty if there was no truth to compare with.
     is_complete : bool
-        Whether no frame is missing, all are tracked, and all was compared and drawn as asked.
+        Whether no frame is missing, nearly all are tracked, and everything asked for was compared
+        and drawn.
     warnings : tuple of str
-        A line each.
+        One line each.
     report : Path or None
-        The page written, if any.
+        The page that was written, if any.
     """
 
     summary: dict[str, Any]
@@ -86,28 +87,28 @@ def run_recording(
         Folder for the trajectories, covariances, tables, summary and report.
     config : Config, optional
     ground_truth : Trajectory or Truth, optional
-        Poses of the base frame; the recording's own where omitted.
+        Poses of the base frame; those of the recording if omitted.
     base_frame : BaseFrame, optional
-        The frame whose poses are written, and its first pose; the camera from the identity where
-        omitted.
+        The frame whose poses are written, and its first pose; if omitted, the camera's, beginning
+        at the identity.
     starts_at_truth : bool
         Start at the true pose of the first frame.
     excerpt : Excerpt, optional
-        Which frames are read; all where omitted.
+        The frames to read; all if omitted.
     outputs : RunOutputs, optional
-        What is written besides the folder's tables; the report where omitted.
+        What to write besides the tables; the report if omitted.
     force : bool
-        Replace an earlier run in the folder, complete or not, and plots.
+        Replace an earlier run in the folder, and plots.
     through : callable, optional
-        Of a camera that is running, see `gvo.frames`; its first images identify no recording.
+        Queues the frames of a running camera; see `gvo.frames`.
     on_start : callable, optional
-        Called before the first frame with the loop, and with what writes the summary and the
-        global poses so far, to be called between frames; it raises `SmoothingError` where the
-        global poses fail. Returns outputs that are given each frame first.
+        Called before the first frame with the loop and a function `save`; returns outputs that
+        get each frame first. `save`, called between frames, writes the summary and the global
+        poses so far, and raises `SmoothingError` if the global poses fail.
     on_progress : callable, optional
         Called after each frame.
     on_written : callable, optional
-        Called when all is computed and written; only the report is drawn after it.
+        Called when everything but the report is written.
 
     Returns
     -------
@@ -116,12 +117,11 @@ def run_recording(
     Raises
     ------
     RecordingError
-        When no frame is usable.
+        If no frame is usable.
     OutputError
-        When the folder holds an earlier run, or something cannot be written; the files hold what
-        was written before.
+        If the folder holds an earlier run, or a file cannot be written; what was written stays.
     RunBusyError
-        When another process is writing a run into the folder.
+        If another process is writing to the folder.
     """
     config = config or Config()
     base_frame = base_frame or BaseFrame(source.info.frame_id)
@@ -156,7 +156,7 @@ def run_recording(
 
 
 def _save(loop: RunLoop, folder: RunFolder, summary: RunningSummary) -> None:
-    """Write what is known in the middle of a run; last the global poses, which may fail."""
+    """Write the summary and the global poses so far; the latter last, since they may fail."""
     loop.count()
     summary.write("running")
     optimum = loop.optimum()
@@ -165,7 +165,7 @@ def _save(loop: RunLoop, folder: RunFolder, summary: RunningSummary) -> None:
 
 
 def _close(files: Iterable[FileOutput]) -> list[str]:
-    """Complete the files; those that are not whole take nothing from the run."""
+    """Close the files; return the reasons why some could not be completed."""
     faults: list[str] = []
     for file in files:
         try:
@@ -177,7 +177,7 @@ def _close(files: Iterable[FileOutput]) -> list[str]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Fault(Failure):
-    """A truth that exists cannot be read, or not be compared."""
+    """A truth exists, but cannot be read or compared."""
 
 
 def _find_truth(
@@ -190,7 +190,7 @@ def _find_truth(
     try:
         return recorded_truth(source, base_frame=base_frame)
     except GvoError as error:
-        # What was not asked for must not keep the run from being made.
+        # Nobody asked for this truth: the run goes on without it.
         return _Fault(reason=str(error))
 
 
@@ -204,7 +204,7 @@ def _conclude(
     *,
     is_asked: bool,
 ) -> RunResult:
-    """Compare with the truth; write truth and summary."""
+    """Compare with the truth, and write the truth and the summary."""
     if loop.statistics.n_with_pose == 0:
         folder.discard()
         raise RecordingError(
@@ -230,7 +230,7 @@ def _conclude(
 def _measure(
     folder: RunFolder, loop: RunLoop, compared: TruthComparison | Failure
 ) -> dict[str, Any]:
-    """Return the path, and how the covariances fit the truth, if there is one."""
+    """Return path length, extent, and how the covariances fit the truth, if there is one."""
     positions = read_trajectory(folder.path / "smoothed.txt")
     found: list[Consistency | None] = []
     if isinstance(compared, TruthComparison):
@@ -257,7 +257,7 @@ def _compare(truth: Truth | Failure, folder: RunFolder, loop: RunLoop) -> TruthC
 
 
 def _within(truth: Truth, folder: RunFolder, loop: RunLoop) -> Truth:
-    """Give poses without stamps, one for each frame, their stamps; cut the truth to an excerpt."""
+    """Give a truth without stamps those of the frames; cut a truth with stamps to the excerpt."""
     stamps_ns = folder.frame_stamps_ns()
     trajectory = truth.trajectory
     if trajectory.stamps_from == "rows" and len(trajectory) == len(stamps_ns):
@@ -283,7 +283,7 @@ def _warnings_of_truth(compared: TruthComparison | Failure) -> list[str]:
 
 
 def drawn(result: RunResult, folder: Path, *, plots: Path | None = None) -> RunResult:
-    """Draw the report of a run; what cannot be drawn takes nothing from what was written."""
+    """Draw the report of a run; if that fails, return the result with a warning."""
     try:
         _draw(folder, plots=plots)
     except (GvoError, OSError) as error:
@@ -297,7 +297,7 @@ def drawn(result: RunResult, folder: Path, *, plots: Path | None = None) -> RunR
 
 
 def _draw_if_interrupted(folder: Path, outputs: RunOutputs, kind: object, *_: object) -> None:
-    """Draw what was written of a run that is interrupted; a second interrupt ends that, too."""
+    """Draw the report of an interrupted run; a second interrupt ends the drawing."""
     if kind is KeyboardInterrupt and outputs.report:
         with suppress(GvoError, OSError):
             _draw(folder, plots=outputs.plots)

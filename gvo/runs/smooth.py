@@ -1,4 +1,4 @@
-"""Edges of any front-end: optimized at once, smoothed by the window, or line by line."""
+"""Smoothing of any front-end's edges: a whole graph at once, or by the window as they come."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ POSES_HEADER = ("stamp_ns", "frame_id", "status", "n_edges", "n_rejected", "reas
 """Columns of `frames.csv` in the folder of smoothed edges."""
 
 _MAX_FOREIGN_LINES = 1000
-"""A stream that begins with so many lines that are not understood holds something else."""
+"""A stream is refused after so many lines without a pose."""
 
 
 @dataclass(slots=True, kw_only=True)
 class SmoothingNotes:
-    """Name, decisions and warnings of a run."""
+    """Name of an input, decisions on how to read it, and warnings."""
 
     recording: str = ""
     decisions: list[str] = field(default_factory=list)
@@ -53,7 +53,7 @@ class SmoothingNotes:
 
 
 class Smoother:
-    """Drives a window and writes a run folder as it goes."""
+    """A window, and the run folder that its poses are written to."""
 
     def __init__(
         self,
@@ -87,7 +87,7 @@ class Smoother:
         return self.window.add_edge(event.frame_id, event.edge)
 
     def add_pose(self, event: PoseEvent) -> Estimate:
-        """Add a pose, and write what it gave."""
+        """Add a pose; write its raw and causal pose and those that became final."""
         causal = self.window.add_pose(event.frame_id, event.stamp_ns, event.edges, event.prior)
         raw = self.chain.advance(causal, event.edges, event.prior)
         self.statuses[causal.status] += 1
@@ -120,19 +120,19 @@ def smooth_edges(
     on_progress: Callable[[Progress], None] | None = None,
     on_written: Callable[[], None] | None = None,
 ) -> RunResult:
-    """Smooth the edges of an input by the window, as they come, and write a run folder.
+    """Smooth the edges of an input in a sliding window and write a run folder.
 
     Parameters
     ----------
     source : EdgeSource
         From `open_edges`.
     out : str or Path
-        Folder for the trajectories, covariances, table of poses, summary and picture; of a pose
+        Folder for the trajectories, covariances, table of poses, summary and picture; for a pose
         graph also `smoothed.g2o`.
     config : Config, optional
-        Of which `window` matters.
+        Of which `window` is used.
     keyframes : {"manual", "distance"}
-        Which poses stay in the window when they are no longer recent: none, or by distance.
+        Which older poses stay in the window: none, or some by their distance.
     ground_truth : Trajectory, optional
         True poses of the same frame.
     force : bool
@@ -140,7 +140,7 @@ def smooth_edges(
     on_progress : callable, optional
         Called after each pose and each edge.
     on_written : callable, optional
-        Called when all poses are written; only the picture is drawn after it.
+        Called when everything but the picture is written.
 
     Returns
     -------
@@ -149,7 +149,7 @@ def smooth_edges(
     Raises
     ------
     RecordingError
-        When the input holds no pose, or the folder holds an earlier run or cannot be written.
+        If the input holds no pose, or the folder holds an earlier run or cannot be written.
     """
     notes = SmoothingNotes(recording=source.name, decisions=source.decisions)
     with _opened(Path(out), source, force=force) as (folder, graph_file):
@@ -169,7 +169,7 @@ def smooth_edges(
 def _opened(
     out: Path, source: EdgeSource | None, *, force: bool, names: Sequence[str] = TRAJECTORIES
 ) -> Iterator[tuple[RunFolder, GraphFile | None]]:
-    """Open the files of a run; complete them also where it is interrupted."""
+    """Open the files of a run, and complete them also if it is interrupted."""
     with (
         written_alone(out, force=force),
         _poses_counted(out),
@@ -187,7 +187,7 @@ def _opened(
 
 @contextmanager
 def _poses_counted(out: Path) -> Iterator[None]:
-    """Say, where a file cannot be written, how many poses stand."""
+    """If a file cannot be written, add to the message how many poses are."""
     try:
         yield
     except (OutputError, TrajectoryError) as error:
@@ -199,7 +199,7 @@ def _poses_counted(out: Path) -> Iterator[None]:
 
 @contextmanager
 def _finished(smoother: Smoother) -> Iterator[None]:
-    """Write what the window holds, also where the work ends early, and then how far it came."""
+    """At the end, also an early one, write the poses in the window and the summary."""
     smoother.folder.write_summary(_summary(smoother) | {"state": "running"})
     try:
         try:
@@ -217,7 +217,7 @@ def _finished(smoother: Smoother) -> Iterator[None]:
 
 
 def _events(source: EdgeSource, notes: SmoothingNotes) -> Iterator[Event]:
-    """Yield events; where the input breaks off, note it and end."""
+    """Yield events; if the input breaks off, note it and end."""
     try:
         yield from source.events()
     except (RecordingError, TrajectoryError) as error:
@@ -232,7 +232,7 @@ def _progress(smoother: Smoother, n_total: int) -> Progress:
 def _with_stamps(
     truth: Trajectory | None, source: EdgeSource, folder: RunFolder
 ) -> Trajectory | None:
-    """Give true poses without stamps those of the poses: both are the order in a file."""
+    """Give true poses that have no stamps those of the poses, row by row."""
     if truth is None or truth.stamps_from != "rows":
         return truth
     stamps_ns = truth.stamps_ns
@@ -246,7 +246,7 @@ def _with_stamps(
 def _conclude(
     smoother: Smoother, truth: Trajectory | None, on_written: Callable[[], None] | None
 ) -> RunResult:
-    """Write summary and picture of a finished run, and compare with the truth."""
+    """Compare with the truth; write the summary and the picture."""
     folder, notes = smoother.folder, smoother.notes
     if smoother.n_poses == 0:
         raise _nothing_to_smooth(notes)
@@ -273,7 +273,7 @@ def _written(
     is_complete: bool,
     on_written: Callable[[], None] | None,
 ) -> RunResult:
-    """Compare with the truth, write summary and picture; `warnings` are of the smoothing itself."""
+    """Compare with the truth; write the summary and the picture."""
     evaluations = _compare(truth, estimates, notes)
     if notes.broken_off:
         cut = f"the input broke off after {summary['frames']} poses: {notes.broken_off}"
@@ -297,7 +297,7 @@ def _written(
 def _compare(
     truth: Trajectory | None, estimates: dict[str, Trajectory], notes: SmoothingNotes
 ) -> tuple[Evaluation, ...]:
-    """Return the errors; where they cannot be computed, a warning is added to the notes."""
+    """Return the errors; if they cannot be computed, add a warning to the notes."""
     if truth is None:
         return ()
     try:
@@ -349,19 +349,18 @@ def optimize(
     Parameters
     ----------
     graph : EdgeSource or mapping of hashable to sequence of Edge
-        From `open_edges`; or of each pose by its name the edges that measure it, in any order,
-        the first pose being the world. Invalid edges are left out, and poses that no edge
-        connects with the first.
+        From `open_edges`, or for each pose (by its name, in any order) the edges to it. The first
+        pose is the world. Invalid edges and poses not connected with the first are left out.
     robust : {"none", "huber", "gnc"}
-        Least squares; Huber's kernel on each edge; or graduated non-convexity: edges count fully
-        or not at all, those between a pose and the next always.
+        Least squares, Huber's kernel on each edge, or graduated non-convexity, by which an edge
+        counts fully or not at all (edges between a pose and the next always count).
     covariances : bool
-        Compute the marginal covariance of each pose; that takes longer than the optimum.
+        Also compute the covariance of every pose (slower).
 
     Returns
     -------
     Trajectory
-        Of a mapping the n-th pose has a stamp of n seconds.
+        For a mapping the stamp of the n-th pose is n seconds.
 
     Raises
     ------
@@ -397,7 +396,7 @@ def optimize(
 
 
 def read_graph(source: EdgeSource, notes: SmoothingNotes) -> WholeGraph:
-    """Read all poses and edges of an input; where it breaks off, `notes` say so."""
+    """Read all poses and edges of an input; if it breaks off, note it."""
     graph = WholeGraph()
     if isinstance(source, PoseGraphSource):
         source.vertices = graph.given
@@ -430,22 +429,20 @@ def optimize_edges(
     source : EdgeSource
         From `open_edges`.
     out : str or Path
-        Folder for raw and smoothed poses, table of poses, summary and picture; of a pose graph
+        Folder for raw and smoothed poses, table of poses, summary and picture; for a pose graph
         also `smoothed.g2o`.
     robust : {"none", "huber", "gnc"}, optional
-        As of `optimize`; where omitted "none" for a pose graph, which states its noise, else
-        "huber".
+        As in `optimize`; by default "none" for a pose graph, which states its noise, else "huber".
     covariances : bool
-        As of `optimize`; where they cannot be computed, the result is not complete and says why.
+        As in `optimize`; if they cannot be computed, the result is not complete and says why.
     ground_truth : Trajectory, optional
         True poses of the same frame.
     force : bool
         Replace an earlier run in the folder, complete or not.
     on_step : callable
-        Called with the state in words after each step. What it raises ends the work; the best
-        poses so far are written first.
+        Called with a text after each step. If it raises, the best poses so far are written first.
     on_written : callable, optional
-        As of `smooth_edges`.
+        As in `smooth_edges`.
 
     Returns
     -------
@@ -454,7 +451,7 @@ def optimize_edges(
     Raises
     ------
     RecordingError
-        When the input holds no pose, or the folder holds an earlier run or cannot be written.
+        If the input holds no pose, or the folder holds an earlier run or cannot be written.
     SmoothingError
         If GTSAM fails.
     """
@@ -478,7 +475,7 @@ def optimize_edges(
             folder.write_summary(_batch_summary(graph, optimizer, robust, notes) | stopped)
             raise
         finally:
-            # Also where the work is interrupted.
+            # Also after an interrupt.
             smoothed = optimizer.trajectory(found)
             folder.add_trajectory("smoothed", smoothed)
             folder.add_trajectory("raw", optimizer.trajectory(of=optimizer.raw))
@@ -493,7 +490,7 @@ def optimize_edges(
 def _write_poses(
     graph: WholeGraph, optimizer: BatchOptimizer, folder: RunFolder, file: GraphFile | None
 ) -> None:
-    """Write the table of poses, and those of a pose graph into its file."""
+    """Write the table of poses, and for a pose graph the poses to its file."""
     folder.add_rows(_rows(graph, optimizer))
     if file is not None:
         for number, T in zip(optimizer.numbers, optimizer.poses(), strict=True):
@@ -517,7 +514,7 @@ def _batch_summary(
 
 
 def _rows(graph: WholeGraph, optimizer: BatchOptimizer) -> Iterator[tuple[object, ...]]:
-    """Yield the rows of the table of poses; each edge counts at both ends."""
+    """Yield the rows of the table of poses; an edge counts for both of its poses."""
     there = set(optimizer.numbers)
     ends = Counter(end for link in graph.links for end in (link.reference, link.frame))
     refused = Counter(end for link in optimizer.refused for end in (link.reference, link.frame))
@@ -563,31 +560,31 @@ def smooth_lines(
     Parameters
     ----------
     lines : iterable of str
-        CSV or JSON, recognised by the first one; see `gvo.io.edges.lines`.
+        CSV or JSON, recognised by the first line; see `gvo.io.edges.lines`.
     answer : callable
-        Gets the answer to each line that holds anything, without its line end: the estimate of
-        the line's pose, or `{"error": ...}`.
+        Gets the answer to each line that is not empty, without line end: the estimate of the
+        line's pose, or `{"error": ...}`.
     out : str or Path
-        Folder, as of `smooth_edges`.
+        Folder, as in `smooth_edges`.
     config : Config, optional
     keyframes : {"manual", "distance"}
-        Which poses stay in the window, besides those of the stream's own `keep`.
+        Which older poses stay in the window, besides those that a line keeps by `keep`.
     ground_truth : Trajectory, optional
         True poses of the same frame.
     force : bool
         Replace an earlier run in the folder, complete or not.
     on_written : callable, optional
-        As of `smooth_edges`.
+        As in `smooth_edges`.
 
     Returns
     -------
     RunResult
-        Not complete where a line was malformed.
+        Not complete if a line was malformed.
 
     Raises
     ------
     RecordingError
-        When no line held a pose, or the folder holds an earlier run or cannot be written.
+        If no line held a pose, or the folder holds an earlier run or cannot be written.
     """
     faults, notes = InputFaults(), SmoothingNotes(recording="standard input")
     with _opened(Path(out), None, force=force) as (folder, _):

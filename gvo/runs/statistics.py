@@ -15,9 +15,9 @@ from gvo.frontend.calibration import RigOffsets
 from gvo.types import FaultyFrame, FrameResult, Progress, SegmentJoin, Status
 
 _BIN_WIDTH = 0.01
-# With more poses that only continue the last velocity, a run is not complete.
+# A run with a larger share of untracked poses is not complete.
 _MAX_UNTRACKED_SHARE = 0.1
-# A robot's moving head or arm displaces its camera by less.
+# The moving head or arm of a robot displaces its camera by less.
 _MAX_MOUNT_TRAVEL_M = 2.0
 
 
@@ -40,7 +40,7 @@ class _Durations:
 
 @dataclass(slots=True, kw_only=True)
 class Segment:
-    """A part of a run that holds together."""
+    """Frames whose relative poses are known; a loss of the camera begins another segment."""
 
     id: int
     first_stamp_ns: int
@@ -125,7 +125,7 @@ class RunStatistics:
         return is_whole and is_tracked
 
     def progress(self, n_images: int) -> Progress:
-        """Return how far the run is, of so many images."""
+        """Return the progress of a run over `n_images` images."""
         n_done = self.n_frames + self.n_unpaired
         return Progress(n_done=n_done, n_total=n_images, n_tracked=self.n_tracked)
 
@@ -164,11 +164,11 @@ class RunStatistics:
         return segment
 
     def add_duration(self, stage: str, elapsed_ms: float) -> None:
-        """Count what one frame took in a stage, milliseconds."""
+        """Count the time of one frame in a stage, milliseconds."""
         self.stages.setdefault(stage, _Durations()).add(elapsed_ms)
 
     def add_faulty(self, frame: FaultyFrame, *, is_loss: bool) -> None:
-        """Count a frame without a pose, or, where it is no loss, an image without partner."""
+        """Count a lost frame, or an image without partner."""
         reason = f"frame at {frame.stamp_ns} ns: {frame.reason}"
         if is_loss:
             self.statuses[Status.SKIPPED] += 1
@@ -182,7 +182,7 @@ class RunStatistics:
         return self.broken_off or self.first_fault or self.first_unpaired or "it holds no image"
 
     def warnings(self) -> list[str]:
-        """Return what was skipped or broke off, a line each."""
+        """Return one line for each thing that went wrong."""
         return [*self._warnings()]
 
     def _warnings(self) -> Iterator[str]:
@@ -247,7 +247,7 @@ class RunStatistics:
         if self.window.n_restored:
             n = self.window.n_restored
             yield f"{n} updates of the window failed and were done again with less"
-        # Gating is the window's daily work, and counted in the summary; anything else is a fault.
+        # Gated edges are normal, and counted in the summary; others should not have been given.
         n_faulty = self.window.n_rejected - self.window.n_gated
         if n_faulty:
             yield f"{n_faulty} edges were refused; the first refusal: {self.window.first_rejected}"

@@ -30,7 +30,7 @@ from gvo.types import Failure, Optimum, Progress
 
 State: TypeAlias = Literal["running", "interrupted", "complete"]
 
-# In which the first images of both streams are looked for.
+# Images among which the first of each stream are looked for.
 _N_FIRST = 20
 
 
@@ -72,7 +72,7 @@ def _truth_json(compared: TruthComparison | Failure) -> dict[str, Any]:
 
 
 def optimum_json(optimum: Optimum | None) -> dict[str, Any] | None:
-    """Return what `summary.json` tells of the global poses; None without them."""
+    """Return what `summary.json` holds of the global poses; None without them."""
     if optimum is None:
         return None
     refused = Counter(loop.reason for loop in optimum.loops)
@@ -105,24 +105,24 @@ def run_identity(
     start: Trajectory | None = None,
     is_live: bool = False,
 ) -> dict[str, Any]:
-    """Return what identifies a run, besides its configuration.
+    """Return what a run depends on besides its configuration, to recognise it again.
 
     Parameters
     ----------
     source : Source
         The first image of either stream is read.
     base_frame : BaseFrame
-        Before the first frame.
+        As before the first frame.
     excerpt : Excerpt or None
     start : Trajectory, optional
-        The true poses, where the run starts at one of them.
+        The true poses, if the run starts at one of them.
     is_live : bool
-        Then no image is read.
+        Read no image.
 
     Returns
     -------
     dict
-        Plain values, as `summary.json` gives them back.
+        Values that are the same after writing and reading JSON.
     """
     info = source.info
     return {
@@ -167,7 +167,7 @@ def _first_images(source: Source) -> Iterator[tuple[str, str]]:
                 if len(streams) == 2:
                     return
     except GvoError:
-        return  # whoever reads on is told
+        return  # the run itself will say so
 
 
 def _describe_image(image: StampedImage) -> str:
@@ -196,7 +196,7 @@ _NOT_YET = Failure(reason="the run has not ended")
 
 
 class RunningSummary(AbstractContextManager["RunningSummary"]):
-    """Replaces `summary.json` every few seconds, and where a run is interrupted."""
+    """Writes `summary.json` every few seconds, and when a run is interrupted."""
 
     def __init__(
         self,
@@ -210,7 +210,7 @@ class RunningSummary(AbstractContextManager["RunningSummary"]):
         self._written_s: float | None = None
 
     def __call__(self, progress: Progress) -> None:
-        """Count a frame."""
+        """Pass progress on, and write the summary if it is old."""
         if self._on_progress is not None:
             self._on_progress(progress)
         if self._written_s is None or time.monotonic() - self._written_s > _EVERY_S:
@@ -225,7 +225,7 @@ class RunningSummary(AbstractContextManager["RunningSummary"]):
         self._written_s = time.monotonic()
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        """Write, where the run is interrupted, how far it came."""
+        """Write how far an interrupted run came."""
         if not isinstance(error, GvoError | KeyboardInterrupt):
             return
         is_output = isinstance(error, OutputError)

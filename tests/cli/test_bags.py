@@ -18,7 +18,7 @@ from gvo.geometry.se3 import make_transform
 from gvo.io.recording import StampedImage
 from gvo.trajectory.formats import read_trajectory
 from gvo.types import FloatArray, IntArray
-from tests.conftest import Command, assert_same_files, interrupt, refused, start
+from tests.conftest import Command, assert_same_files, refused
 from tests.make.bags import ODOMETRY, PoseBag
 from tests.rendered_walk import (
     CAMERA,
@@ -245,14 +245,6 @@ def test_the_bag_of_a_run_is_no_recording(command: Command, walk_bag: Path, tmp_
     assert "run.mcap was written by a run" in refused(command("check", walk_bag, bag.write()))
 
 
-def test_bag_and_folder_are_no_recording(command: Command, walk_bag: Path, tmp_path: Path) -> None:
-    (tmp_path / "folder").mkdir()
-    said = refused(
-        command("run", "--no-report", walk_bag, tmp_path / "folder", "--out", tmp_path / "out")
-    )
-    assert "only bags can be combined into one recording" in said
-
-
 @pytest.mark.parametrize("suffix", [".bag", ".mcap"])
 def test_of_a_cut_bag_what_can_be_read_is_run(
     command: Command, walk_run: Path, tmp_path: Path, suffix: str
@@ -310,17 +302,6 @@ def matrix(pose: Any) -> FloatArray:
     q, t = pose.orientation, pose.position
     R = np.asarray(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix())
     return make_transform(R, np.array([t.x, t.y, t.z]))
-
-
-def test_a_signal_leaves_a_bag_that_can_be_read(walk_bag: Path, tmp_path: Path) -> None:
-    path, out = tmp_path / "run.mcap", tmp_path / "out"
-    process = start("run", "--no-report", walk_bag, "--out", out, "--bag", path)
-    code, errors = interrupt(process, out / "frames.csv")
-    assert (code, errors.count("\n")) == (130, 1)
-    assert errors.startswith("gvo: interrupted; ")
-    messages = read_bag(path)
-    for name in TRAJECTORIES:
-        assert len(messages[f"/gvo/{name}/odometry"]) == len(poses(out, name))
 
 
 def findings(answer: Any) -> dict[str, str]:

@@ -28,6 +28,7 @@ from tests.conftest import (
     refused,
     start,
 )
+from tests.rendered_walk import read_bag
 from tests.viz.explanation.test_explanation import DESCRIPTORS, TRACKS
 
 COMMANDS = (
@@ -197,24 +198,22 @@ def test_errors_are_printed_if_the_page_cannot_be_written(command: Command, tmp_
         assert "ATE" in answer.out
 
 
-@pytest.mark.parametrize(
-    ("number", "code"),
-    [
-        pytest.param(signal.SIGINT, 130, id="INT"),
-        pytest.param(signal.SIGTERM, 143, id="TERM", marks=pytest.mark.acceptance),
-    ],
-)
-def test_a_film_that_is_broken_off_shows_all_frames_until_then(
-    drive_bag: Path, tmp_path: Path, number: signal.Signals, code: int
+def test_what_is_written_beside_an_interrupted_run_holds_all_frames_until_then(
+    drive_bag: Path, tmp_path: Path
 ) -> None:
-    options = ["--overlay", tmp_path / "film.webm", "--rerun", tmp_path / "run.rrd"]
+    film, stream, bag = (tmp_path / name for name in ("film.webm", "run.rrd", "run.mcap"))
+    options = ["--overlay", film, "--rerun", stream, "--bag", bag]
     process = start("run", drive_bag, "--out", tmp_path, *options)
     frames = tmp_path / "frames.csv"
-    found, errors = interrupt(process, frames, number)
-    assert (found, errors.count("\n")) == (code, 1)
+    found, errors = interrupt(process, frames, signal.SIGINT)
+    assert (found, errors.count("\n")) == (130, 1)
     assert errors.startswith("gvo: interrupted; ")
-    assert len(film_frames(tmp_path / "film.webm")) == count_rows(frames) < 20
-    assert starts_rightly(tmp_path / "run.rrd")
+    assert len(film_frames(film)) == count_rows(frames) < 20
+    assert starts_rightly(stream)
+    messages = read_bag(bag)
+    for name in ("raw", "causal", "smoothed"):
+        n_poses = len(gvo.read_trajectory(tmp_path / f"{name}.txt"))
+        assert len(messages[f"/gvo/{name}/odometry"]) == n_poses == count_rows(frames)
     assert (tmp_path / "report.html").exists()
 
 

@@ -14,7 +14,6 @@ from gvo.io.bag.source import BagSource
 from tests.conftest import (
     TABLES,
     Command,
-    interrupt,
     is_one_line,
     line_of_poses,
     python,
@@ -294,20 +293,6 @@ def test_a_shell_completes_options(monkeypatch: pytest.MonkeyPatch, command: Com
     monkeypatch.setenv("COMP_WORDS", "gvo run --grou")
     monkeypatch.setenv("COMP_CWORD", "2")
     assert command().out == "--ground-truth\n"
-
-
-@pytest.mark.parametrize(
-    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["INT", "TERM"]
-)
-def test_a_signal_ends_the_run_with_its_code_and_complete_files(
-    drive_bag: Path, tmp_path: Path, number: signal.Signals, code: int
-) -> None:
-    process = start("run", drive_bag, "--out", tmp_path)
-    said = f"gvo: interrupted; the poses so far are in {tmp_path}; --force begins anew\n"
-    assert interrupt(process, tmp_path / "frames.csv", number) == (code, said)
-    assert json.loads((tmp_path / "summary.json").read_text())["state"] == "interrupted"
-    n_poses = {len(gvo.read_trajectory(tmp_path / f"{name}.txt")) for name in ("raw", "smoothed")}
-    assert len(n_poses) == 1
 
 
 def write_poses(path: Path, n: int = 20) -> Path:

@@ -17,7 +17,6 @@ from dynamic_reconfigure.client import Client
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from rosgraph_msgs.msg import Clock, Log
 from sensor_msgs.msg import CameraInfo, Image
-from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 PATIENCE_S = 20.0
@@ -51,21 +50,6 @@ class SetPose:
     _md5sum = "4f3e0bbe7a24e1f929488cd1970222d3"
     _request_class = SetPoseRequest
     _response_class = SetPoseResponse
-
-
-class Garbage(genpy.Message):  # type: ignore[misc]
-    """Says that it is an image."""
-
-    _type = Image._type
-    _md5sum = Image._md5sum
-    _full_text = Image._full_text
-    __slots__ = ("data",)
-
-    def __init__(self, data: bytes) -> None:
-        self.data = data
-
-    def serialize(self, buffer: io.BytesIO) -> None:
-        buffer.write(self.data)
 
 
 class Got:
@@ -177,29 +161,6 @@ def parameters() -> dict[str, Any]:
         "kind": listed["features__kind"]["edit_method"],
         "answers": answers,
     }
-
-
-def hostile() -> dict[str, Any]:
-    """Send what is no image."""
-    garbage = publisher("/cam/image", Garbage)
-    for data in (b"", b"\xff" * 5, b"\xff" * 4096, bytes(11)):
-        garbage.publish(Garbage(data))
-    until(lambda: not garbage.impl.connections[0]._queue, "a queue")
-    return {}
-
-
-def of_another_type() -> dict[str, Any]:
-    """Announce images as something else, and be refused."""
-    made = rospy.Publisher("/cam/image", String, queue_size=10)
-    sys.stdin.read()
-    return {"n": made.get_num_connections()}
-
-
-def an_image() -> dict[str, Any]:
-    sent = image(2)
-    publisher("/cam/image", Image, latch=True).publish(sent)
-    sys.stdin.read()
-    return {"image": digest(sent)}
 
 
 def main() -> None:

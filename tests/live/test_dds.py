@@ -316,7 +316,7 @@ send(2, Text(77, 2, "ab"))
 say(answer(2).text)
 """)
     assert other.line() == "abab"
-    assert "/gvo/echo: a request is left out" in caplog.text
+    assert "/gvo/echo: a request is ignored" in caplog.text
 
 
 @pytest.mark.linux

@@ -1,9 +1,7 @@
 """A server for Foxglove, asked by a plain WebSocket client in another process."""
 
 import base64
-import contextlib
 import json
-import random
 import socket
 import struct
 import subprocess
@@ -16,8 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 import gvo
@@ -316,8 +312,8 @@ def test_a_closed_server_lets_go_of_its_port_and_takes_no_harm(server: Foxglove)
     server.offer(parameters)
     publisher = server.advertise("/gvo/note", "std_msgs/msg/String")
     port = int(server.url.rpartition(":")[2])
-    with Client(server.url) as client:
-        server.close()
+    with Client(server.url) as client, socket.create_connection(("127.0.0.1", port)):
+        server.close()  # while one has said nothing yet
         assert client.process.wait(_LIMIT_S) is not None
     publisher.publish(b"\0\1\0\0", 0)
     parameters.set({"klt.n_corners": 250})
@@ -325,61 +321,17 @@ def test_a_closed_server_lets_go_of_its_port_and_takes_no_harm(server: Foxglove)
     Foxglove(port=port).close()
 
 
-def noise(rng: random.Random) -> Iterator[str | bytes]:
-    """Yield what no client of sound mind sends."""
-    yield from ("", "garbage", "[]", "{}", "[" * 100_000, '{"op": 3}', '{"op": "subscribe"}')
-    for number in (-1, 2**31, 2**64, 1e300, None, "x"):
-        pairs = [{"id": number, "channelId": number}]
-        yield json.dumps({"op": "subscribe", "subscriptions": pairs})
-        yield json.dumps({"op": "unsubscribe", "subscriptionIds": [number]})
-    yield json.dumps({"op": "getParameters", "parameterNames": ["x" * 100_000] * 50, "id": "i"})
-    huge: list[object] = [None, 1e300, 10**40, "x" * 100_000, [1] * 10_000]
-    bad = [*huge, {"a": {}}, [[[]]], True]
-    for value in bad:
-        for kind in ("byte_array", "float64", "float64_array", "none", None):
-            each = {"name": "klt.n_corners", "value": value, "type": kind}
-            yield json.dumps({"op": "setParameters", "parameters": [each, each], "id": "i"})
-    each = {"name": "\0" * 100_000, "value": 1}
-    yield json.dumps({"op": "setParameters", "parameters": [each] * 10})
-    for _ in range(100):
-        yield rng.randbytes(rng.randrange(40))
-        head = struct.pack("<BIII", _CALL, rng.randrange(3), rng.getrandbits(32), 3)
-        yield head + b"cdr" + rng.randbytes(rng.randrange(60))
-    yield bytes([_CALL]) + b"\xff" * 12 + bytes(1_000_000)
-
-
-def test_a_hostile_client_is_survived(server: Foxglove, capfd: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("value", [1e300, 10**40, "x" * 1000, [1, 2], {"a": {}}, True])
+def test_a_value_that_cannot_be_is_refused_and_others_are_served(
+    server: Foxglove, value: object
+) -> None:
     parameters = Parameters(Config())
     server.offer(parameters)
-    server.serve(Service(name="/gvo/set_pose", type=SET_POSE, answer=lambda request: {}))
-    server.advertise("/gvo/note", "std_msgs/msg/String", is_latched=True).publish(b"\0\1\0\0", 0)
-    address = ("127.0.0.1", int(server.url.rpartition(":")[2]))
-    mute = [socket.create_connection(address) for _ in range(100)]
-    for connection in mute[:50]:
-        connection.sendall(b"\x16\x03\x01 GET / HTTP/9\r\n\r\n")
     with Client(server.url) as client:
-        for each in noise(random.Random(1)):
-            if isinstance(each, str):
-                client._send(each)
-            else:
-                client.send_bytes(each)
-    huge = connect(server.url, subprotocols=[PROTOCOL], compression=None)
-    with contextlib.suppress(ConnectionClosed), huge:
-        huge.send(bytes(70_000_000))
-        while True:
-            huge.recv(timeout=_LIMIT_S)
-    with Client(server.url) as client:  # others are served as before
-        assert client.parameters("klt.n_corners") == {
-            "klt.n_corners": parameters.config.klt.n_corners
-        }
-        client.subscribe("/gvo/note")
-        client.receive(1)
-        assert client.data == [("/gvo/note", 0, b"\0\1\0\0")]
-        assert isinstance(client.call("/gvo/set_pose", pose_request(0.0)), bytes)
-    server.close()  # while some have said nothing yet
-    for connection in mute:
-        connection.close()
-    assert capfd.readouterr().err == ""
+        client.assign(**{"klt.n_corners": value})
+        shown = client.parameters("klt.n_corners")
+    assert shown == {"klt.n_corners": Config().klt.n_corners}
+    assert parameters.config == Config()
 
 
 @pytest.mark.acceptance

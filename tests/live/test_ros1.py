@@ -87,21 +87,6 @@ def test_parameters_change_by_the_client_of_dynamic_reconfigure(ros: Ros, node: 
     assert len(node.errors) == 1
 
 
-@pytest.mark.acceptance
-def test_a_hostile_node_is_survived(ros: Ros, node: Program) -> None:
-    ros.ask(PEER, "hostile")
-    other = ros.start(PEER, "of_another_type")
-    other.wait_for("types do not match")
-    other.end()
-    peer = ros.start(PEER, "an_image")
-    node.wait_for('"image"')
-    assert peer.end() == 0
-    node.end()
-    (image,) = events(node, "image")
-    assert image["digest"] == json.loads(peer.lines[0])["image"]
-    assert len(events(node, "fault")) == 4
-
-
 def pose(values: list[float]) -> FloatArray:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = Rotation.from_quat(values[3:]).as_matrix(), values[:3]

@@ -435,7 +435,7 @@ def test_images_that_nobody_takes_are_given_up_with_a_word(
     play = Play(drive_bag, script)
     play._thread.join(timeout=60)
     assert len([*play.reader.images()]) == 300
-    assert caplog.text.count("images are given up") == 1
+    assert caplog.text.count("images are dropped") == 1
 
 
 def test_topics_of_gvo_itself_are_no_camera() -> None:
