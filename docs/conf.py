@@ -37,7 +37,7 @@ numpydoc_xref_aliases = {
     "Source": "gvo.io.recording.Source",
     "Calibration": "gvo.geometry.camera.Calibration",
     "CheckResult": "gvo.diagnostics.check.findings.CheckResult",
-    "Conversion": "gvo.io.convert.common.Conversion",
+    "Conversion": "gvo.io.convert.convert.Conversion",
     "FrameLink": "gvo.types.FrameLink",
     "SegmentJoin": "gvo.types.SegmentJoin",
 }

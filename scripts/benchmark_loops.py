@@ -183,8 +183,8 @@ def judge(source: Source, config: gvo.Config, spoiling: Spoiling) -> list[float]
 
 def tracked(record: RunRecord, trajectory: gvo.Trajectory) -> gvo.Trajectory:
     """Return the poses of frames that were registered."""
-    is_tracked = np.isin(record.frames.statuses, ("ok", "resumed"))
-    return trajectory.select(np.isin(trajectory.stamps_ns, record.frames.stamps_ns[is_tracked]))
+    is_tracked = np.isin(record.frames["status"].astype(str), ("ok", "resumed"))
+    return trajectory.select(np.isin(trajectory.stamps_ns, record.frames["stamp_ns"][is_tracked]))
 
 
 def of_visits(truth: gvo.Trajectory, estimates: Sequence[gvo.Trajectory]) -> list[float]:

@@ -354,8 +354,7 @@ def convert_(
     parameters: opt.Parameters,
 ) -> None:
     """Write a recording as a bag, or as a folder of KITTI, EuRoC or TUM."""
-    from gvo.io.convert.common import check_new
-    from gvo.io.convert.convert import convert
+    from gvo.io.convert.convert import check_new, convert
 
     check_new(target)
     source = opt.open_source(recordings, parameters, options)

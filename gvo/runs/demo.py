@@ -11,7 +11,7 @@ import numpy as np
 
 from gvo.errors import RecordingError, write_faults
 from gvo.io.convert.bag_messages import BagWriter, FramePose, write_transforms
-from gvo.io.convert.bag_writer import write_bag
+from gvo.io.convert.convert import convert
 from gvo.io.opening import open_recording
 from gvo.io.run_folder.line_file import check_new
 from gvo.io.run_folder.writer import check_unused
@@ -51,7 +51,7 @@ def write_demo_bags(folder: Path, *, progress: Callable[[int], None] | None = No
         for name in (BAG_NAME, ROBOT_NAME):
             (folder / name).unlink(missing_ok=True)
         write_robot_bag(drive.ground_truth(), folder / ROBOT_NAME)
-    write_bag(drive, folder / BAG_NAME, progress=progress)
+    convert(drive, folder / BAG_NAME, progress=progress)
 
 
 def _drive() -> SyntheticRecording:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeAlias, get_args
 
 from gvo._version import __version__
 from gvo.backend.batch import BatchOptimizer, Robust, WholeGraph
@@ -25,7 +25,7 @@ from gvo.io.edges.lines import (
     is_header,
     parse_line,
 )
-from gvo.io.edges.pose_graph import GraphFile, PoseGraphSource
+from gvo.io.edges.pose_graph import GRAPH, PoseGraphSource, write_graph
 from gvo.io.run_folder.writer import PICTURE, TRAJECTORIES, RunFolder, written_alone
 from gvo.odometry.chain import EdgeChain
 from gvo.runs.run import RunResult
@@ -33,13 +33,17 @@ from gvo.runs.summary import peak_memory_mb
 from gvo.trajectory.evaluation import Evaluation, evaluate, evaluations_json
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Edge, Estimate, FrameId, PositionPrior, Progress, Rejected, Status
+from gvo.types import Edge, Estimate, FloatArray, FrameId, PositionPrior, Progress, Rejected, Status
 
 POSES_HEADER = ("stamp_ns", "frame_id", "status", "n_edges", "n_rejected", "reason")
 """Columns of `frames.csv` in the folder of smoothed edges."""
 
 _MAX_FOREIGN_LINES = 1000
 """A stream is refused after so many lines without a pose."""
+
+
+SmoothedPose: TypeAlias = tuple[int, FrameId, FloatArray]
+"""Stamp in nanoseconds, name, T_world_frame."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -62,9 +66,9 @@ class Smoother:
         notes: SmoothingNotes | None = None,
         *,
         keyframes: Keeping = "distance",
-        graph_file: GraphFile | None = None,
+        poses: list[SmoothedPose] | None = None,
     ) -> None:
-        self.folder, self.config, self._graph_file = folder, config, graph_file
+        self.folder, self.config, self._poses = folder, config, poses
         self.notes = notes or SmoothingNotes()
         self.window = SlidingWindow(config.window, keyframes=keyframes)
         self.statuses: Counter[Status] = Counter()
@@ -103,9 +107,8 @@ class Smoother:
 
     def _add_finished(self, finished: list[Estimate]) -> None:
         self.folder.add_smoothed(finished)
-        if self._graph_file is not None:
-            for each in finished:
-                self._graph_file.add(each.stamp_ns, each.frame_id, each.T_world_frame)
+        if self._poses is not None:
+            self._poses += [(each.stamp_ns, each.frame_id, each.T_world_frame) for each in finished]
         self.chain.forget(estimate.frame_id for estimate in finished)
 
 
@@ -152,10 +155,8 @@ def smooth_edges(
         If the input holds no pose, or the folder holds an earlier run or cannot be written.
     """
     notes = SmoothingNotes(recording=source.name, decisions=source.decisions)
-    with _opened(Path(out), source, force=force) as (folder, graph_file):
-        smoother = Smoother(
-            folder, config or Config(), notes, keyframes=keyframes, graph_file=graph_file
-        )
+    with _opened(Path(out), source, force=force) as (folder, poses):
+        smoother = Smoother(folder, config or Config(), notes, keyframes=keyframes, poses=poses)
         with _finished(smoother):
             for event in _events(source, notes):
                 smoother.take(event)
@@ -168,21 +169,25 @@ def smooth_edges(
 @contextmanager
 def _opened(
     out: Path, source: EdgeSource | None, *, force: bool, names: Sequence[str] = TRAJECTORIES
-) -> Iterator[tuple[RunFolder, GraphFile | None]]:
-    """Open the files of a run, and complete them also if it is interrupted."""
+) -> Iterator[tuple[RunFolder, list[SmoothedPose] | None]]:
+    """Open the files of a run, and complete them also if it is interrupted.
+
+    The list is for the poses of a pose graph, which are written at the end.
+    """
     with (
         written_alone(out, force=force),
         _poses_counted(out),
         RunFolder(out, columns=POSES_HEADER, names=names) as folder,
     ):
+        (out / GRAPH).unlink(missing_ok=True)
         if not isinstance(source, PoseGraphSource):
             yield folder, None
             return
-        graph_file = GraphFile(out)
+        poses: list[SmoothedPose] = []
         try:
-            yield folder, graph_file
+            yield folder, poses
         finally:
-            graph_file.close(source.measurement_lines())
+            write_graph(out, poses, source.measurement_lines)
 
 
 @contextmanager
@@ -399,7 +404,7 @@ def read_graph(source: EdgeSource, notes: SmoothingNotes) -> WholeGraph:
     """Read all poses and edges of an input; if it breaks off, note it."""
     graph = WholeGraph()
     if isinstance(source, PoseGraphSource):
-        source.vertices = graph.given
+        graph.given.update(source.vertices)
     for event in _events(source, notes):
         if isinstance(event, PoseEvent):
             if isinstance(event.prior, PositionPrior):
@@ -462,7 +467,7 @@ def optimize_edges(
     if not graph.frame_ids:
         raise _nothing_to_smooth(notes)
     optimizer = BatchOptimizer(graph, robust, on_step=on_step)
-    with _opened(Path(out), source, force=force, names=("raw", "smoothed")) as (folder, file):
+    with _opened(Path(out), source, force=force, names=("raw", "smoothed")) as (folder, poses):
         found = None
         try:
             optimizer.run()
@@ -479,22 +484,15 @@ def optimize_edges(
             smoothed = optimizer.trajectory(found)
             folder.add_trajectory("smoothed", smoothed)
             folder.add_trajectory("raw", optimizer.trajectory(of=optimizer.raw))
-            _write_poses(graph, optimizer, folder, file)
+            folder.add_rows(_rows(graph, optimizer))
+            if poses is not None:
+                for number, T in zip(optimizer.numbers, optimizer.poses(), strict=True):
+                    poses.append((graph.stamps_ns[number], graph.frame_ids[number], T))
     estimates = {"raw": optimizer.trajectory(of=optimizer.raw), "smoothed": smoothed}
     truth = _with_stamps(ground_truth, source, folder)
     warnings = list(_batch_warnings(graph, optimizer))
     summary = _batch_summary(graph, optimizer, robust, notes)
     return _written(folder, summary, estimates, truth, notes, warnings, not warnings, on_written)
-
-
-def _write_poses(
-    graph: WholeGraph, optimizer: BatchOptimizer, folder: RunFolder, file: GraphFile | None
-) -> None:
-    """Write the table of poses, and for a pose graph the poses to its file."""
-    folder.add_rows(_rows(graph, optimizer))
-    if file is not None:
-        for number, T in zip(optimizer.numbers, optimizer.poses(), strict=True):
-            file.add(graph.stamps_ns[number], graph.frame_ids[number], T)
 
 
 def _batch_summary(

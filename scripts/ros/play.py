@@ -27,6 +27,7 @@ import rospy
 import gvo
 from gvo.config import SyncConfig
 from gvo.io.bag.topics import IMAGE_TYPE
+from gvo.io.convert.bag import BagStream, BagStreams, plan_streams, static_poses
 from gvo.io.convert.bag_messages import (
     Header,
     MessageWriter,
@@ -34,7 +35,6 @@ from gvo.io.convert.bag_messages import (
     write_image,
     write_transforms,
 )
-from gvo.io.convert.bag_writer import BagStream, BagStreams, plan_streams, static_poses
 from gvo.io.frames import paired
 from gvo.io.recording import Source, StampedImage
 from gvo.types import FaultyFrame

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import gvo
 from gvo.geometry.se3 import make_transform
-from gvo.io.convert.convert import convert, write_folder
+from gvo.io.convert.convert import convert
 from gvo.io.recording import StampedImage
 from gvo.io.synthetic import SyntheticRecording
 from gvo.trajectory.formats import read_trajectory
@@ -67,7 +67,7 @@ def test_the_body_of_a_data_set_is_a_frame_of_its_bag(command: Command, tmp_path
     R = np.asarray(Rotation.from_euler("xyz", [80, -10, 95], degrees=True).as_matrix())
     T_body_cam = make_transform(R, np.array([0.1, -0.2, 0.3]))
     source.info = replace(source.info, T_body_cam=T_body_cam)
-    write_folder(source, tmp_path / "euroc", layout="euroc")
+    convert(source, tmp_path / "euroc", layout="euroc")
     for name in ("a.bag", "b.mcap"):
         assert command("convert", tmp_path / "euroc", tmp_path / name).code == 0
     outs = []

@@ -95,7 +95,7 @@ def _g2o_file(data: bytes) -> None:
     source = PoseGraphSource(_folder().write("graph.g2o", data))
     for _ in source.events():
         pass
-    for _ in source.measurement_lines():
+    for _ in source.measurement_lines:
         pass
     source.faults.warnings()
 

@@ -19,8 +19,8 @@ from tf2_msgs.msg import TFMessage
 
 import gvo
 from gvo.io.bag.topics import CAMERA_INFO_TYPE, IMAGE_TYPE
+from gvo.io.convert.bag import plan_streams
 from gvo.io.convert.bag_messages import Header, write_camera_info, write_image
-from gvo.io.convert.bag_writer import plan_streams
 from scripts.ros.play import PATIENCE_S, Answers, Writer, introduce, until
 
 

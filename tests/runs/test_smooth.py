@@ -160,7 +160,7 @@ def test_covariances_are_those_of_gtsam_and_can_be_read_back(tmp_path: Path) -> 
     np.testing.assert_allclose(found, np.array(expected), rtol=1e-3, atol=1e-8)
     assert record.trajectories["raw"].covariances is None
     assert len(record.trajectories["causal"]) == 0
-    assert record.frames.statuses == ("ok",) * 27
+    assert record.frames["status"].tolist() == ["ok"] * 27
 
 
 def test_poses_whose_covariances_fail_are_written_without_them(

@@ -21,7 +21,6 @@ from gvo.geometry.camera import Calibration
 from gvo.io.bag.reader import TF_TYPE, serialize, typestore
 from gvo.io.bag.topics import CAMERA_INFO_TYPE, COMPRESSED_TYPE, IMAGE_TYPE
 from gvo.io.images import MILLIMETRES, encode_image, exact_counts
-from gvo.io.poses.truth import TRUTH_FRAMES
 from gvo.types import DepthArray, FloatArray, ImageArray
 
 # Version 8 is read by more releases of ROS 2 than 9, and holds the same.
@@ -333,9 +332,3 @@ def pose_numbers(T_parent_child: FloatArray) -> FloatArray:
     """Return position and quaternion (x, y, z, qx, qy, qz, qw), shape (7,), of a pose (4, 4)."""
     quaternion_xyzw = Rotation.from_matrix(T_parent_child[:3, :3]).as_quat()
     return np.concatenate([T_parent_child[:3, 3], quaternion_xyzw])
-
-
-def write_truth(writer: MessageWriter, stamp_ns: int, T_world_cam: FloatArray) -> None:
-    """Write a true pose of the rectified camera, shape (4, 4), metres, to `/tf`."""
-    parent, child = TRUTH_FRAMES.parent, TRUTH_FRAMES.child
-    write_transforms(writer, "/tf", [FramePose(stamp_ns, parent, child, T_world_cam)])

@@ -4,47 +4,84 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
+
+from rosbags.rosbag1 import WriterError as WriterError1
+from rosbags.rosbag2 import WriterError as WriterError2
 
 from gvo.config import Config
 from gvo.errors import RecordingError, write_faults
 from gvo.io.bag.source import BagSource
-from gvo.io.convert import common
-from gvo.io.convert.bag_writer import write_bag
-from gvo.io.convert.folders import EurocFolder, FolderStreams, KittiFolder, TumFolder
+from gvo.io.convert.bag import BagTarget
+from gvo.io.convert.folders import EurocTarget, KittiTarget, TumTarget
+from gvo.io.convert.target import LeftOut, Options, Target, readable_images
 from gvo.io.opening import BAG_SUFFIXES
 from gvo.io.recording import RecordingInfo, Source
 
-Layout: TypeAlias = Literal["kitti", "euroc", "tum"]
-_Progress: TypeAlias = Callable[[int], None]
+Layout: TypeAlias = Literal["bag", "kitti", "euroc", "tum"]
+
+_TARGETS: dict[Layout, type[Target]] = {
+    "bag": BagTarget,
+    "kitti": KittiTarget,
+    "euroc": EurocTarget,
+    "tum": TumTarget,
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Conversion:
+    """What a conversion wrote.
+
+    Parameters
+    ----------
+    path : Path
+        The new bag or folder.
+    n_images : int
+        Images written, of both streams.
+    n_poses : int
+        Poses of the ground truth written.
+    skipped : tuple of str
+        What was left out and why, a line each: an image, the ground truth, the rest of a
+        recording that cannot be read on.
+    """
+
+    path: Path
+    n_images: int
+    n_poses: int
+    skipped: tuple[str, ...]
 
 
 def convert(
     source: Source,
     path: str | Path,
     *,
-    layout: Literal["bag"] | Layout | None = None,
+    layout: Layout | None = None,
     rectify: bool = False,
     compress: bool = False,
     config: Config | None = None,
-    progress: _Progress | None = None,
-) -> common.Conversion:
+    progress: Callable[[int], None] | None = None,
+) -> Conversion:
     """Write a recording as a bag or as a data-set folder.
+
+    Where a recording cannot be read on, what was read is kept, and the reason is in `skipped`.
 
     Parameters
     ----------
     source : Source
         The recording.
     path : str or Path
-        With the suffix of a bag, one file; without a suffix, a folder.
+        `.bag`: a bag of ROS 1. `.mcap` or `.db3`: a single file of ROS 2. No suffix: a folder.
     layout : {"bag", "kitti", "euroc", "tum"}, optional
-        Of the folder: where omitted, a bag becomes a data-set folder and such a folder a ROS 2
-        bag.
+        Of the folder: where omitted, a bag becomes a data-set folder (`tum` for RGB-D; for stereo
+        `euroc` where the images are raw and stay so, else `kitti`, which holds rectified pairs
+        only) and such a folder a ROS 2 bag.
     rectify : bool
         Write raw images rectified and grey, as the frames hold them.
     compress : bool
-        Write the images of a bag as PNG; those of data sets are.
+        Write the images of a bag as PNG; those of data sets are. Depth becomes PNG where the first
+        image is of whole millimetres.
     config : Config, optional
         Of which `sync` matters, for the pairs of a KITTI folder.
     progress : callable, optional
@@ -57,58 +94,8 @@ def convert(
     Raises
     ------
     RecordingError
-        When the path exists or cannot be written, the layout does not fit, or no image can be
-        read.
-    """
-    path = Path(path)
-    if layout is None and (path.suffix or not isinstance(source, BagSource)):
-        layout = "bag"
-    if layout == "bag":
-        return write_bag(source, path, rectify=rectify, compress=compress, progress=progress)
-    if path.suffix in BAG_SUFFIXES:
-        raise RecordingError(
-            f"{path}: --layout {layout} makes a folder, expected no name of a bag; leave "
-            f"{path.suffix} away, or --layout"
-        )
-    if compress:
-        raise RecordingError(f"{path}: --png is for bags; the images of data sets are PNG anyway")
-    return write_folder(
-        source, path, layout=layout, rectify=rectify, config=config, progress=progress
-    )
-
-
-def write_folder(
-    source: Source,
-    path: str | Path,
-    *,
-    layout: Layout | None = None,
-    rectify: bool = False,
-    config: Config | None = None,
-    progress: _Progress | None = None,
-) -> common.Conversion:
-    """Write a recording as the folder of a data set, its images as PNG without loss.
-
-    Where a recording cannot be read on, what was read is kept, and the reason is in `skipped`.
-
-    Parameters
-    ----------
-    source, rectify, config, progress
-        As of `convert`.
-    path : str or Path
-        Folder to make.
-    layout : {"kitti", "euroc", "tum"}, optional
-        `tum` for RGB-D; for stereo `euroc` where the images are raw and stay so, else `kitti`,
-        which holds rectified pairs only: unpaired images are left out.
-
-    Returns
-    -------
-    Conversion
-
-    Raises
-    ------
-    RecordingError
-        When the path exists or cannot be written, the layout does not fit the sensor, the name
-        stands for another camera, or no image can be read.
+        When the path exists or cannot be written, the layout does not fit, a stamp does not fit,
+        or no image can be read.
 
     Notes
     -----
@@ -118,34 +105,69 @@ def write_folder(
     EuRoC does not keep R and P: its readers rectify anew, by K, D and the places of the cameras.
     """
     path = Path(path)
-    common.check_new(path)
-    layout = _choose(source.info, layout, rectify=rectify)
+    if layout is None and (path.suffix or not isinstance(source, BagSource)):
+        layout = "bag"
+    _check(path, layout, compress=compress)
+    layout = layout if layout == "bag" else _choose(source.info, layout, rectify=rectify)
+    left_out, options = LeftOut(), Options(rectify, compress, (config or Config()).sync)
     with (
-        write_faults(RecordingError, path),
-        tempfile.TemporaryDirectory(dir=path.parent, prefix=".convert-") as parent,
+        write_faults(RecordingError, path, WriterError1, WriterError2),
+        tempfile.TemporaryDirectory(dir=path.parent, prefix=".convert-") as folder,
     ):
-        folder = Path(parent) / path.name
-        left_out = common.LeftOut()
-        writer: FolderStreams
-        if layout == "kitti":
-            writer = KittiFolder(folder, source, left_out, (config or Config()).sync)
-        else:
-            make = EurocFolder if layout == "euroc" else TumFolder
-            writer = make(folder, source, left_out, rectify=rectify)
-        n_images, n_poses = _write(writer, source, progress)
-        folder.rename(path)
-    return common.Conversion(
-        path=path, n_images=n_images, n_poses=n_poses, skipped=left_out.lines()
+        target = _TARGETS[layout](Path(folder) / path.name, source, left_out, options)
+        with target:
+            for image in target.select(readable_images(source, left_out)):
+                target.add(image)
+                if progress is not None:
+                    progress(sum(target.n_images))
+            _check_images(target)
+            target.finish()
+        target.path.rename(path)
+    return Conversion(
+        path=path,
+        n_images=sum(target.n_images),
+        n_poses=target.n_poses,
+        skipped=left_out.lines(),
     )
 
 
+def check_new(path: Path) -> None:
+    """Refuse a target that exists, or whose folder does not.
+
+    Raises
+    ------
+    RecordingError
+        With what to do.
+    """
+    if path.exists():
+        raise RecordingError(f"{path}: exists already; give another path or remove it")
+    if not path.parent.is_dir():
+        raise RecordingError(f"{path}: cannot be written: {path.parent} is no folder")
+
+
+def _check(path: Path, layout: Layout | None, *, compress: bool) -> None:
+    if layout == "bag" and path.suffix not in (*BAG_SUFFIXES, ""):
+        raise RecordingError(
+            f"{path}: expected a name ending in .bag, .mcap or .db3, or a folder name without "
+            f"a suffix, got {path.suffix}; give --layout for the folder of a data set"
+        )
+    if layout != "bag" and path.suffix in BAG_SUFFIXES:
+        raise RecordingError(
+            f"{path}: --layout {layout} makes a folder, expected no name of a bag; leave "
+            f"{path.suffix} away, or --layout"
+        )
+    if layout != "bag" and compress:
+        raise RecordingError(f"{path}: --png is for bags; the images of data sets are PNG anyway")
+    check_new(path)
+
+
 def _choose(info: RecordingInfo, layout: Layout | None, *, rectify: bool) -> Layout:
+    """Return the layout of a folder: the one asked for, else the one that fits best."""
+    fitting: tuple[Layout, ...] = ("euroc", "kitti")
     if info.sensor == "rgbd":
-        fitting: tuple[Layout, ...] = ("tum",)
+        fitting = ("tum",)
     elif info.calibrations[0].is_rectified or rectify:
         fitting = ("kitti", "euroc")
-    else:
-        fitting = ("euroc", "kitti")
     if layout is None:
         return fitting[0]
     if layout not in fitting:
@@ -156,15 +178,9 @@ def _choose(info: RecordingInfo, layout: Layout | None, *, rectify: bool) -> Lay
     return layout
 
 
-def _write(writer: FolderStreams, source: Source, progress: _Progress | None) -> tuple[int, int]:
-    """Return the number of images, and of true poses."""
-    n_images = [0, 0]
-    for image in writer.select(common.readable_images(source, writer.left_out)):
-        n_images[image.stream] += writer.add(image)
-        if progress is not None:
-            progress(sum(n_images))
-    common.check_images((n_images[0], n_images[1]), source, writer.left_out)
-    truth = common.true_poses(source, writer.left_out)
-    n_poses = 0 if truth is None else writer.add_truth(truth)
-    writer.close()
-    return sum(n_images), n_poses
+def _check_images(target: Target) -> None:
+    """Refuse a recording without an image of either stream, which no reader would take."""
+    if not all(target.n_images):
+        name = target.info.stream_names[target.n_images.index(0)]
+        reason = "; ".join(target.left_out.lines()[:1]) or "the recording holds none"
+        raise RecordingError(f"{target.info.name}: no {name} image can be written: {reason}")

@@ -1,8 +1,7 @@
-"""Folders written in the layouts of KITTI, EuRoC and TUM."""
+"""Recordings written as folders in the layouts of KITTI, EuRoC and TUM."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,11 +10,10 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from gvo.config import SyncConfig
 from gvo.errors import RecordingError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
-from gvo.io.convert.common import LeftOut, load_image, plan_images, pose_of_right, pose_on_body
+from gvo.io.convert.target import LeftOut, Options, Target, pose_of_right, pose_on_body
 from gvo.io.datasets.tum import DEFAULT_SCALE, published_calibration
 from gvo.io.frames import paired
 from gvo.io.images import MAX_COUNT, MILLIMETRES, encode_image, is_in_counts, to_counts
@@ -30,169 +28,92 @@ _SCALES = (MILLIMETRES, DEFAULT_SCALE)
 _RESERVE = 1.5
 
 
-class FolderStreams(ABC):
-    """Writes the two streams of a recording in one layout.
-
-    Parameters
-    ----------
-    source : Source
-        The recording.
-    left_out : LeftOut
-        Gets what cannot be written.
-    rectify : bool
-        Write raw images rectified and grey.
-    """
-
-    def __init__(self, source: Source, left_out: LeftOut, *, rectify: bool) -> None:
-        self.info = source.info
-        self.left_out = left_out
-        self.calibrations, self._preparers = plan_images(self.info, rectify=rectify)
-
-    def select(self, images: Iterator[StampedImage]) -> Iterator[StampedImage]:
-        """Yield what the layout can hold: images with a stamp of their own."""
-        last_ns: list[int | None] = [None, None]
-        for image in images:
-            before_ns = last_ns[image.stream]
-            if before_ns is not None and image.stamp_ns <= before_ns:
-                reason = f"the stamp does not advance from {before_ns} ns"
-                self.left_out.add_image(self.name_of(image.stream), image.stamp_ns, reason)
-                continue
-            last_ns[image.stream] = image.stamp_ns
-            yield image
-
-    def add(self, image: StampedImage) -> bool:
-        """Write an image; False, with a note, where it cannot be read."""
-        name, prepare = self.name_of(image.stream), self._preparers[image.stream]
-        pixels = load_image(image, prepare, name, self.left_out)
-        if pixels is not None:
-            self._write(image, pixels)
-        return pixels is not None
-
-    @abstractmethod
-    def _write(self, image: StampedImage, pixels: NDArray[Any]) -> None: ...
-
-    @abstractmethod
-    def add_truth(self, truth: Trajectory) -> int:
-        """Write T_world_cam of the rectified camera, and return the number of poses."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Write what is known at the end."""
-
-    def name_of(self, stream: int) -> str:
-        """Return what an image of a stream is called in notes."""
-        return f"{self.info.stream_names[stream]} image"
-
-
-class KittiFolder(FolderStreams):
+class KittiTarget(Target):
     """Rectified pairs by number: `image_0` and `image_1`, in colour `image_2` and `image_3`.
 
-    Parameters
-    ----------
-    folder : Path
-        To be made.
-    source : Source
-        A stereo recording.
-    left_out : LeftOut
-        Gets what cannot be written.
-    sync : SyncConfig
-        Which images are a pair; its stamp is that of the left one.
+    The stamp of a pair is that of the left image; unpaired images are left out.
     """
 
-    def __init__(self, folder: Path, source: Source, left_out: LeftOut, sync: SyncConfig) -> None:
-        super().__init__(source, left_out, rectify=True)
-        self._folder, self._sync = folder, sync
+    def __init__(self, path: Path, source: Source, left_out: LeftOut, options: Options) -> None:
+        super().__init__(path, source, left_out, options._replace(rectify=True))
+        self._sync = options.sync
         self._stamps_ns: list[int] = []
         self._folders: tuple[str, str] | None = None
-        folder.mkdir()
+        path.mkdir()
 
     def select(self, images: Iterator[StampedImage]) -> Iterator[StampedImage]:
         """Yield the images of pairs, left before right; what cannot be read keeps its number."""
         for pair in paired(images, self.info.sensor, self._sync):
             if isinstance(pair, FaultyFrame):
-                self.left_out.add_image(self.name_of(0), pair.stamp_ns, pair.reason)
+                self.left_out.add_image(self.names[0], pair.stamp_ns, pair.reason)
             else:
                 self._stamps_ns.append(pair[0].stamp_ns)
                 yield from pair
 
-    def _write(self, image: StampedImage, pixels: NDArray[Any]) -> None:
+    def write(self, image: StampedImage, pixels: NDArray[Any]) -> None:
+        """Write an image under the number of its pair."""
         if self._folders is None:
             self._folders = ("image_2", "image_3") if pixels.ndim == 3 else ("image_0", "image_1")
             for name in self._folders:
-                (self._folder / name).mkdir()
+                (self.path / name).mkdir()
         number = len(self._stamps_ns) - 1
-        path = self._folder / self._folders[image.stream] / f"{number:06d}.png"
+        path = self.path / self._folders[image.stream] / f"{number:06d}.png"
         path.write_bytes(encode_image(pixels, ".png"))
 
-    def add_truth(self, truth: Trajectory) -> int:
-        """Write a pose for each pair, where there is one for all of them."""
-        at_frames = truth.interpolate(np.array(self._stamps_ns, dtype=np.int64))
-        if len(at_frames) < len(self._stamps_ns):
-            self.left_out.add(
-                f"poses.txt: {len(at_frames)} of {len(self._stamps_ns)} pairs lie between true "
-                "poses, all are needed"
-            )
-            return 0
-        # The layout's poses are those of the camera that P is stated for: P = K [I | t_cam_cam0].
-        P = self.info.calibrations[0].P
-        t_cam_cam0 = np.linalg.solve(P[:, :3], P[:, 3])
-        T_cam_cam0 = se3.make_transform(np.eye(3), np.asarray(t_cam_cam0))
-        write_kitti(self._folder / "poses.txt", at_frames.transformed(T_cam_cam0))
-        return len(at_frames)
-
-    def close(self) -> None:
-        """Write stamps and calibration."""
-        lines = [f"{format_stamp(stamp_ns)}\n" for stamp_ns in self._stamps_ns]
-        (self._folder / "times.txt").write_text("".join(lines), encoding="utf-8")
+    def finish(self) -> None:
+        """Write stamps, calibration, and a pose for each pair where all of them have one."""
+        if self.truth is not None:
+            self._write_truth(self.truth)
+        times = "".join(f"{format_stamp(stamp_ns)}\n" for stamp_ns in self._stamps_ns)
+        (self.path / "times.txt").write_text(times, encoding="utf-8")
         # P of left and right: `PN` of `image_N`.
         names = self._folders or ("image_0", "image_1")
         lines = [
             f"P{name[-1]}: {' '.join(map(repr, _numbers(calibration.P)))}\n"
             for name, calibration in zip(names, self.calibrations, strict=True)
         ]
-        (self._folder / "calib.txt").write_text("".join(lines), encoding="utf-8")
+        (self.path / "calib.txt").write_text("".join(lines), encoding="utf-8")
+
+    def _write_truth(self, truth: Trajectory) -> None:
+        at_frames = truth.interpolate(np.array(self._stamps_ns, dtype=np.int64))
+        if len(at_frames) < len(self._stamps_ns):
+            self.left_out.add(
+                f"poses.txt: {len(at_frames)} of {len(self._stamps_ns)} pairs lie between true "
+                "poses, all are needed"
+            )
+            return
+        # The layout's poses are those of the camera that P is stated for: P = K [I | t_cam_cam0].
+        P = self.info.calibrations[0].P
+        t_cam_cam0 = np.linalg.solve(P[:, :3], P[:, 3])
+        T_cam_cam0 = se3.make_transform(np.eye(3), np.asarray(t_cam_cam0))
+        write_kitti(self.path / "poses.txt", at_frames.transformed(T_cam_cam0))
+        self.n_poses = len(at_frames)
 
 
-class EurocFolder(FolderStreams):
+class EurocTarget(Target):
     """Pairs by stamp, raw or rectified, with the calibration of each camera.
 
-    Parameters
-    ----------
-    folder : Path
-        To be made.
-    source : Source
-        A stereo recording. Where it does not place its cameras on a body, the rectified left
-        camera is the body.
-    left_out : LeftOut
-        Gets what cannot be written.
-    rectify : bool
-        Write raw images rectified and grey.
+    Where the recording does not place its cameras on a body, the rectified left camera is it.
     """
 
-    def __init__(self, folder: Path, source: Source, left_out: LeftOut, *, rectify: bool) -> None:
-        super().__init__(source, left_out, rectify=rectify)
-        self._root = folder / "mav0"
+    def __init__(self, path: Path, source: Source, left_out: LeftOut, options: Options) -> None:
+        super().__init__(path, source, left_out, options)
+        self._root = path / "mav0"
         self._tables: tuple[list[str], list[str]] = ([], [])
         T_body_cam = pose_on_body(source)
         self._T_body_cam = np.eye(4) if T_body_cam is None else T_body_cam
         for name in ("cam0", "cam1"):
             (self._root / name / "data").mkdir(parents=True)
 
-    def _write(self, image: StampedImage, pixels: NDArray[Any]) -> None:
+    def write(self, image: StampedImage, pixels: NDArray[Any]) -> None:
+        """Write an image, and its row of the table."""
         name = f"{image.stamp_ns}.png"
         path = self._root / f"cam{image.stream}" / "data" / name
         path.write_bytes(encode_image(pixels, ".png"))
         self._tables[image.stream].append(f"{image.stamp_ns},{name}\n")
 
-    def add_truth(self, truth: Trajectory) -> int:
-        """Write the poses of the body."""
-        folder = self._root / "state_groundtruth_estimate0"
-        folder.mkdir()
-        write_euroc(folder / "data.csv", truth.transformed(se3.invert(self._T_body_cam)))
-        return len(truth)
-
-    def close(self) -> None:
-        """Write the tables of images and the calibrations."""
+    def finish(self) -> None:
+        """Write the tables of images, the calibrations, and the true poses of the body."""
         for stream, rows in enumerate(self._tables):
             camera = self._root / f"cam{stream}"
             text = "#timestamp [ns],filename\n" + "".join(rows)
@@ -202,78 +123,63 @@ class EurocFolder(FolderStreams):
             T_rectified_written = se3.make_transform(written.R, np.zeros(3))
             T_body_written = self._T_body_cam @ T_left_rectified @ T_rectified_written
             _write_sensor_yaml(camera / "sensor.yaml", written, T_body_written)
+        if self.truth is not None:
+            folder = self._root / "state_groundtruth_estimate0"
+            folder.mkdir()
+            write_euroc(folder / "data.csv", self.truth.transformed(se3.invert(self._T_body_cam)))
+            self.n_poses = len(self.truth)
 
 
-class TumFolder(FolderStreams):
-    """Colour and depth by stamp, with `calibration.yaml`.
+class TumTarget(Target):
+    """Colour and depth by stamp, with `calibration.yaml`."""
 
-    Parameters
-    ----------
-    folder : Path
-        To be made.
-    source : Source
-        An RGB-D recording.
-    left_out : LeftOut
-        Gets what cannot be written.
-    rectify : bool
-        Write raw images rectified and grey.
-
-    Raises
-    ------
-    RecordingError
-        When the name of the folder stands for another camera.
-    """
-
-    def __init__(self, folder: Path, source: Source, left_out: LeftOut, *, rectify: bool) -> None:
-        super().__init__(source, left_out, rectify=rectify)
-        self._folder = folder
+    def __init__(self, path: Path, source: Source, left_out: LeftOut, options: Options) -> None:
+        super().__init__(path, source, left_out, options)
         self._tables: tuple[list[str], list[str]] = ([], [])
-        self._scale = self._scale_by_name()
+        self._scale = _scale_by_name(path.name, self.calibrations[0])
         self._n_cut = 0
         for name in ("rgb", "depth"):
-            (folder / name).mkdir(parents=True)
+            (path / name).mkdir(parents=True)
 
-    def _write(self, image: StampedImage, pixels: NDArray[Any]) -> None:
+    def write(self, image: StampedImage, pixels: NDArray[Any]) -> None:
+        """Write an image, and its row of the table."""
         name = f"{('rgb', 'depth')[image.stream]}/{format_stamp(image.stamp_ns)}.png"
         if image.stream == 1:
             if self._scale is None:
                 self._scale = _choose_scale(pixels)
             pixels, n_cut = to_counts(pixels, self._scale or DEFAULT_SCALE)
             self._n_cut += n_cut
-        (self._folder / name).write_bytes(encode_image(pixels, ".png"))
+        (self.path / name).write_bytes(encode_image(pixels, ".png"))
         self._tables[image.stream].append(f"{format_stamp(image.stamp_ns)} {name}\n")
 
-    def add_truth(self, truth: Trajectory) -> int:
-        """Write the poses as they are."""
-        write_tum(self._folder / "groundtruth.txt", truth)
-        return len(truth)
-
-    def close(self) -> None:
-        """Write the tables of images and the calibration."""
+    def finish(self) -> None:
+        """Write the tables of images, the calibration and the true poses."""
         scale = self._scale or DEFAULT_SCALE
         for name, rows in zip(("rgb", "depth"), self._tables, strict=True):
             text = f"# {name} images\n# stamp filename\n" + "".join(rows)
-            (self._folder / f"{name}.txt").write_text(text, encoding="utf-8")
-        path = self._folder / "calibration.yaml"
+            (self.path / f"{name}.txt").write_text(text, encoding="utf-8")
+        path = self.path / "calibration.yaml"
         _write_camera_info_yaml(path, self.calibrations[0], depth_scale=scale)
         if self._n_cut:
             self.left_out.add(
                 f"depth: {self._n_cut} pixels beyond {MAX_COUNT / scale:.1f} m became unknown"
             )
+        if self.truth is not None:
+            write_tum(self.path / "groundtruth.txt", self.truth)
+            self.n_poses = len(self.truth)
 
-    def _scale_by_name(self) -> float | None:
-        """Return the scale that the folder's name stands for; None where it stands for none."""
-        published = published_calibration(self._folder.name)
-        if published is None:
-            return None
-        mine = self.calibrations[0]
-        if any(not np.array_equal(getattr(published, name), getattr(mine, name)) for name in "KDP"):
-            raise RecordingError(
-                f"{self._folder.name}: a TUM folder of this name is read with the published "
-                "calibration of freiburg1, 2 or 3, which is not that of the recording; give "
-                "another name"
-            )
-        return DEFAULT_SCALE
+
+def _scale_by_name(name: str, mine: Calibration) -> float | None:
+    """Return the scale that a folder's name stands for; None where it stands for none."""
+    published = published_calibration(name)
+    if published is None:
+        return None
+    if any(not np.array_equal(getattr(published, key), getattr(mine, key)) for key in "KDP"):
+        raise RecordingError(
+            f"{name}: a TUM folder of this name is read with the published calibration of "
+            "freiburg1, 2 or 3, which is not that of the recording; give another name"
+        )
+    return DEFAULT_SCALE
 
 
 def _choose_scale(depth: DepthArray) -> float | None:

@@ -38,6 +38,7 @@ CSV_HEADER = (
     + ",rejected"
 )
 """Columns of an answer in CSV; written first where the input begins with a header."""
+_LAYOUTS = {"pose": " (x y z qx qy qz qw)", "covariance": " (its upper triangle)"}
 _CHUNK_BYTES = 65536
 _POLL_SECONDS = 0.2
 # What is cut off here is still longer than what is understood.
@@ -98,7 +99,7 @@ def parse_line(line: str, line_format: LineFormat) -> Request:
 
 
 def parse_csv(line: str) -> Request:
-    """Return what a line of CSV asks for; the fields are those of the module's table.
+    """Return what a line of CSV asks for; its fields become those of a JSON line.
 
     Examples
     --------
@@ -109,21 +110,31 @@ def parse_csv(line: str) -> Request:
         fields = [field.strip() for field in next(csv.reader([line]), [])]
     except csv.Error as error:
         raise ValueError(f"no line of CSV: {error}") from None
-    if len(fields) == 2 and fields[0] in _ACTIONS:
-        return Request(frame_id=_csv_id(fields[1]), keep=fields[0] == "keep")
     if len(fields) < 2:
         raise ValueError(f"expected at least an id and a stamp, got {len(fields)} fields")
-    frame_id = _csv_id(fields[0])
-    stamp_ns = None if not fields[1] else _csv_stamp(fields[1])
-    if len(fields) == 2 or (len(fields) == 3 and not fields[2]):
-        return Request(frame_id=frame_id, stamp_ns=stamp_ns)
-    numbers = _numbers(fields[3:])
-    if fields[2]:
-        edge = _edge(fields[2], numbers[:7], _noise(numbers[7:], 6))
-        return Request(frame_id=frame_id, stamp_ns=stamp_ns, edges=(edge,))
-    n_values = 3 if len(numbers) in (3, 6, 9) else 7
-    noise = _noise(numbers[n_values:], 3 if n_values == 3 else 6)
-    return Request(frame_id=frame_id, stamp_ns=stamp_ns, prior=_prior(numbers[:n_values], noise))
+    if len(fields) == 2 and fields[0] in _ACTIONS:
+        return _request({"id": fields[1], "keep": fields[0] == "keep"})
+    content: dict[str, object] = {"id": fields[0], "stamp_ns": _csv_stamp(fields[1])}
+    if len(fields) > 3 or (len(fields) == 3 and fields[2]):
+        content |= _csv_measurement(fields[2], _csv_numbers(fields[3:]))
+    return _request(content)
+
+
+def _csv_measurement(reference: str, numbers: list[float]) -> dict[str, object]:
+    """Return an edge to a reference, or without one a prior, with its noise, as JSON has them."""
+    is_position = not reference and len(numbers) in (3, 6, 9)
+    n_values, size = (3, 3) if is_position else (7, 6)
+    noise = numbers[n_values:]
+    n_upper = size * (size + 1) // 2
+    if len(noise) not in (0, size, n_upper):
+        raise ValueError(
+            f"after the measurement come nothing, {size} sigmas or {n_upper} numbers of a "
+            f"covariance, got {len(noise)}"
+        )
+    name = "sigmas" if len(noise) == size else "covariance"
+    measured: dict[str, object] = {"position" if is_position else "pose": numbers[:n_values]}
+    measured |= {name: noise} if noise else {}
+    return {"reference": reference, **measured} if reference else {"prior": measured}
 
 
 def parse_json(line: str) -> Request:
@@ -144,7 +155,10 @@ def parse_json(line: str) -> Request:
         content = json.loads(line)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"no JSON: {error}") from None
-    content = _object(content, _KEYS, "a line")
+    return _request(_object(content, _KEYS, "a line"))
+
+
+def _request(content: Mapping[str, object]) -> Request:
     if "id" not in content:
         raise ValueError("the id is missing")
     keep = content.get("keep")
@@ -152,22 +166,15 @@ def parse_json(line: str) -> Request:
         raise ValueError("keep must be true or false")
     stamp_ns = content.get("stamp_ns")
     return Request(
-        frame_id=_json_id(content["id"], "id"),
-        stamp_ns=None if stamp_ns is None else _json_stamp(stamp_ns),
-        edges=tuple(_json_edge(edge) for edge in _json_edges(content)),
-        prior=_json_prior(content.get("prior")),
+        frame_id=_id(content["id"], "id"),
+        stamp_ns=None if stamp_ns is None else _stamp(stamp_ns),
+        edges=tuple(_edge(edge) for edge in _edges(content)),
+        prior=_prior(content.get("prior")),
         keep=keep,
     )
 
 
-def _csv_id(text: str) -> str:
-    if not text:
-        raise ValueError("the id is empty")
-    _check_id(text, "id")
-    return text
-
-
-def _json_id(value: object, name: str) -> str | int:
+def _id(value: object, name: str) -> str | int:
     if isinstance(value, bool) or not isinstance(value, str | int) or value == "":
         raise ValueError(f"{name} must be a text or a whole number, got {shortened(value)}")
     _check_id(value, name)
@@ -187,14 +194,21 @@ def _is_writable(text: str) -> bool:
     return not any("\ud800" <= character <= "\udfff" for character in text)
 
 
-def _csv_stamp(text: str) -> int:
+def _csv_stamp(text: str) -> int | None:
     try:
-        return _json_stamp(int(plain_number(text)))
+        return int(plain_number(text)) if text else None
     except ValueError:
         raise ValueError(f"the stamp {shortened(text)} is no whole number of nanoseconds") from None
 
 
-def _json_stamp(value: object) -> int:
+def _csv_numbers(fields: list[str]) -> list[float]:
+    try:
+        return [float(plain_number(field)) for field in fields]
+    except ValueError as error:
+        raise ValueError(f"{error}; expected numbers after the reference") from None
+
+
+def _stamp(value: object) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or abs(value) >= _STAMP_LIMIT_NS:
         raise ValueError(f"the stamp {shortened(value)} is no whole number of nanoseconds")
     return value
@@ -212,7 +226,7 @@ def _object(value: object, keys: frozenset[str], what: str) -> dict[str, object]
     return value
 
 
-def _json_edges(content: Mapping[str, object]) -> list[dict[str, object]]:
+def _edges(content: Mapping[str, object]) -> list[dict[str, object]]:
     """Return the edges of a line: the one that stands in the line itself, and the list."""
     edges = content.get("edges", [])
     if not isinstance(edges, list):
@@ -221,112 +235,73 @@ def _json_edges(content: Mapping[str, object]) -> list[dict[str, object]]:
     return [*([own] if own else []), *(_object(edge, _EDGE_KEYS, "an edge") for edge in edges)]
 
 
-def _json_edge(content: Mapping[str, object]) -> Edge:
+def _edge(content: Mapping[str, object]) -> Edge:
     if content.get("reference") is None or "pose" not in content:
         raise ValueError("an edge needs a reference and a pose")
-    reference_id = _json_id(content["reference"], "reference")
-    noise = _json_noise(content, 6)
-    return _edge(reference_id, _json_numbers(content, "pose"), noise, content.get("kernel"))
+    reference_id, T = _id(content["reference"], "reference"), _pose(content)
+    covariance = _covariance(content, 6)
+    if covariance is None:
+        with np.errstate(over="ignore", invalid="ignore"):  # infinite: the window refuses it
+            covariance = StepSigma().covariance(T)
+    return Edge(
+        reference_id=reference_id,
+        T_reference_frame=T,
+        covariance=covariance,
+        kernel=content.get("kernel"),  # type: ignore[arg-type] # checked by Edge
+    )
 
 
-def _json_prior(content: object) -> Prior | None:
+def _prior(content: object) -> Prior | None:
     if content is None:
         return None
     content = _object(content, _PRIOR_KEYS, "a prior")
-    name, size = ("position", 3) if "position" in content else ("pose", 7)
-    if name not in content or ("position" in content and "pose" in content):
+    if ("position" in content) == ("pose" in content):
         raise ValueError("a prior needs a pose or a position")
-    values = _json_numbers(content, name)
-    if len(values) != size:
-        raise ValueError(f"a {name} needs {size} numbers, got {len(values)}")
-    noise = _json_noise(content, 3 if size == 3 else 6)
-    return _prior(values, noise, content.get("kernel"))
+    kernel = content.get("kernel")
+    chosen: dict[str, Any] = {} if kernel is None else {"kernel": kernel}  # checked by the prior
+    if "pose" in content:
+        covariance = _covariance(content, 6)
+        covariance = np.diag(_PRIOR_SIGMAS**2) if covariance is None else covariance
+        return PosePrior(T_world_frame=_pose(content), covariance=covariance, **chosen)
+    position = _numbers(content, "position", 3)
+    covariance = _covariance(content, 3)
+    covariance = np.diag(_PRIOR_SIGMAS[3:] ** 2) if covariance is None else covariance
+    return PositionPrior(position_world=position, covariance=covariance, **chosen)
 
 
-def _json_noise(content: Mapping[str, object], size: int) -> FloatArray | None:
+def _pose(content: Mapping[str, object]) -> FloatArray:
+    numbers = _numbers(content, "pose", 7)
+    return np.asarray(transforms_of(numbers[np.newaxis])[0])
+
+
+def _covariance(content: Mapping[str, object], size: int) -> FloatArray | None:
+    """Return the covariance of the sigmas, or of the upper triangle; None where there is none."""
     if "sigmas" in content and "covariance" in content:
         raise ValueError("give sigmas or covariance, not both")
     if "sigmas" in content:
-        sigmas = _json_numbers(content, "sigmas")
-        if len(sigmas) != size:
-            raise ValueError(f"sigmas need {size} numbers, got {len(sigmas)}")
-        return _noise(sigmas, size)
-    if "covariance" not in content:
-        return None
-    upper = _json_numbers(content, "covariance")
-    if len(upper) != size * (size + 1) // 2:
-        raise ValueError(
-            f"a covariance needs the {size * (size + 1) // 2} numbers of its upper triangle, "
-            f"got {len(upper)}"
-        )
-    return _noise(upper, size)
+        sigmas = _numbers(content, "sigmas", size)
+        if (sigmas < 0.0).any():
+            raise ValueError("a sigma is negative")
+        with np.errstate(over="ignore"):  # infinite: the window refuses it
+            return np.diag(sigmas**2)
+    if "covariance" in content:
+        return from_upper_triangle(_numbers(content, "covariance", size * (size + 1) // 2))
+    return None
 
 
-def _json_numbers(content: Mapping[str, object], name: str) -> FloatArray:
+def _numbers(content: Mapping[str, object], name: str, n: int) -> FloatArray:
     values = content[name]
     is_number = isinstance(values, list) and all(
         isinstance(value, int | float) and not isinstance(value, bool) for value in values
     )
     if not is_number:
         raise ValueError(f"{name} must be a list of numbers")
+    if len(values) != n:
+        raise ValueError(f"{name} needs {n} numbers{_LAYOUTS.get(name, '')}, got {len(values)}")
     try:
         return np.array(values, dtype=np.float64)
     except OverflowError:
         raise ValueError(f"a number of {name} is out of range") from None
-
-
-def _numbers(fields: list[str]) -> FloatArray:
-    try:
-        return np.array([float(plain_number(field)) for field in fields])
-    except ValueError as error:
-        raise ValueError(f"{error}; expected numbers after the reference") from None
-
-
-def _noise(numbers: FloatArray, size: int) -> FloatArray | None:
-    """Return the covariance of sigmas, or of an upper triangle; None where there are none."""
-    n_upper = size * (size + 1) // 2
-    if len(numbers) == 0:
-        return None
-    if len(numbers) == size:
-        if (numbers < 0.0).any():
-            raise ValueError("a sigma is negative")
-        with np.errstate(over="ignore"):  # infinite: the window refuses it
-            return np.diag(numbers**2)
-    if len(numbers) != n_upper:
-        raise ValueError(
-            f"after the measurement come nothing, {size} sigmas or {n_upper} numbers of a "
-            f"covariance, got {len(numbers)}"
-        )
-    return from_upper_triangle(numbers)
-
-
-def _pose(numbers: FloatArray) -> FloatArray:
-    if len(numbers) != 7:
-        raise ValueError(f"a pose needs x y z qx qy qz qw, got {len(numbers)} numbers")
-    return np.asarray(transforms_of(numbers[np.newaxis])[0])
-
-
-def _edge(
-    reference_id: str | int, numbers: FloatArray, noise: FloatArray | None, kernel: object = None
-) -> Edge:
-    T = _pose(numbers)
-    if noise is None:
-        with np.errstate(over="ignore", invalid="ignore"):  # likewise
-            noise = StepSigma().covariance(T)
-    return Edge(
-        reference_id=reference_id,
-        T_reference_frame=T,
-        covariance=noise,
-        kernel=kernel,  # type: ignore[arg-type] # checked by Edge
-    )
-
-
-def _prior(numbers: FloatArray, noise: FloatArray | None, kernel: object = None) -> Prior:
-    covariance = np.diag(_PRIOR_SIGMAS**2) if noise is None else noise
-    chosen: dict[str, Any] = {} if kernel is None else {"kernel": kernel}  # checked by the prior
-    if len(numbers) == 3:
-        return PositionPrior(position_world=numbers, covariance=covariance[-3:, -3:], **chosen)
-    return PosePrior(T_world_frame=_pose(numbers), covariance=covariance, **chosen)
 
 
 def format_estimate(

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from gvo.io.run_folder.reader import EdgeTable, FrameTable, TimingTable
+from gvo.io.run_folder.reader import Table
 from gvo.trajectory.alignment import AlignMode
 from gvo.trajectory.evaluation import (
     KITTI_SEGMENTS_M,
@@ -225,9 +225,9 @@ def _draw_band(axes: Any, x: FloatArray, reach: FloatArray) -> None:  # noqa: AN
         axes.fill_between(x, -reach, reach, color=_RAW.color, **looks)
 
 
-def status_plot(frames: FrameTable) -> Plot:
+def status_plot(frames: Table) -> Plot:
     """Return the ribbon of statuses, a row for each that occurs."""
-    if len(frames.stamps_ns) == 0:
+    if len(frames["stamp_ns"]) == 0:
         return _plot("status", text="Not drawn: the run has no frame.")
     return _plot(
         "status",
@@ -237,13 +237,13 @@ def status_plot(frames: FrameTable) -> Plot:
     )
 
 
-def _ribbon(frames: FrameTable) -> Figure:
-    counts = Counter(frames.statuses)
+def _ribbon(frames: Table) -> Figure:
+    counts = Counter(frames["status"])
     names = [name for name in dict.fromkeys([*palette.STATUSES, *counts]) if counts[name]]
     figure = new_figure(0.85 + 0.32 * len(names))
     axes = figure.subplots()
-    x = elapsed(frames.stamps_ns, int(frames.stamps_ns[0]))
-    statuses = np.array(frames.statuses)
+    x = elapsed(frames["stamp_ns"], int(frames["stamp_ns"][0]))
+    statuses = frames["status"]
     for row, name in enumerate(names):
         axes.broken_barh(
             _spans(x, statuses == name),
@@ -291,14 +291,14 @@ def _time_axes(height: float, label: str) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def count_plot(frames: FrameTable) -> Plot:
+def count_plot(frames: Table) -> Plot:
     """Return keypoints, points, matches and inliers per frame."""
-    present = {n: frames.counts[n] for n in palette.COUNTS if n in frames.counts}
-    has_pose = np.array([status != "skipped" for status in frames.statuses], dtype=np.bool_)
+    present = {n: frames[f"n_{n}"] for n in palette.COUNTS if f"n_{n}" in frames}
+    has_pose = frames["status"] != "skipped"
     if not present or not np.any(has_pose):
         return _plot("counts", text="Not drawn: the run has no counts; its edges were given.")
     figure, axes = _time_axes(3.0, "number per frame [-]")
-    x = elapsed(frames.stamps_ns, int(frames.stamps_ns[0]))
+    x = elapsed(frames["stamp_ns"], int(frames["stamp_ns"][0]))
     for name, counts in present.items():
         y = np.where(has_pose, counts, np.nan).astype(np.float64)
         if name in ("matches", "inliers"):
@@ -314,8 +314,8 @@ def count_plot(frames: FrameTable) -> Plot:
     return _plot("counts", text=text, figure=figure)
 
 
-def _inlier_words(frames: FrameTable) -> str:
-    matches, inliers = (frames.counts.get(name) for name in ("matches", "inliers"))
+def _inlier_words(frames: Table) -> str:
+    matches, inliers = frames.get("n_matches"), frames.get("n_inliers")
     if matches is None or inliers is None or not np.any(matches > 0):
         return "here no frame was matched."
     is_matched = matches > 0
@@ -327,11 +327,12 @@ def _inlier_words(frames: FrameTable) -> str:
     )
 
 
-def timing_plot(timings: TimingTable | None) -> Plot:
+def timing_plot(timings: Table) -> Plot:
     """Return the milliseconds per frame, stacked by stage."""
-    if timings is None or len(timings.stamps_ns) == 0 or not timings.stages_ms:
+    stages_ms = {name: values for name, values in timings.items() if name.endswith("_ms")}
+    if not stages_ms or len(timings["stamp_ns"]) == 0:
         return _plot("timings", text="Not drawn: the run has no times of its stages.")
-    table = np.nan_to_num(np.stack(list(timings.stages_ms.values())))
+    table = np.nan_to_num(np.stack(list(stages_ms.values())))
     total = table.sum(axis=0)
     median, slow = np.quantile(total, [0.5, 0.95])
     figure, axes = _time_axes(3.2, "milliseconds per frame [ms]")
@@ -349,21 +350,21 @@ def timing_plot(timings: TimingTable | None) -> Plot:
     )
 
 
-def _stack(axes: Axes, timings: TimingTable, table: FloatArray) -> None:
-    x = elapsed(timings.stamps_ns, int(timings.stamps_ns[0]))
+def _stack(axes: Axes, timings: Table, table: FloatArray) -> None:
+    x = elapsed(timings["stamp_ns"], int(timings["stamp_ns"][0]))
     if len(x) == 1:  # a stack of one frame has no width
         x, table = np.array([-0.5, 0.5]), np.repeat(table, 2, axis=1)
-    stages = timings.stages_ms
+    stages = [name.removesuffix("_ms") for name in timings if name.endswith("_ms")]
     labels = [f"{name} ({np.median(row):.1f})" for name, row in zip(stages, table, strict=True)]
     colours = [palette.STAGES.get(name, _UNKNOWN) for name in stages]
     looks: dict[str, Any] = {"step": "mid", "lw": 0, "rasterized": len(x) > MANY}
     axes.stackplot(x, table, labels=labels, colors=colours, **looks)
 
 
-def _rate_words(timings: TimingTable, total: FloatArray) -> str:
-    if len(timings.stamps_ns) < 2:
+def _rate_words(timings: Table, total: FloatArray) -> str:
+    if len(timings["stamp_ns"]) < 2:
         return "A good run stays below the frame period."
-    period_ms = float(np.median(np.diff(np.sort(timings.stamps_ns)))) / 1e6
+    period_ms = float(np.median(np.diff(np.sort(timings["stamp_ns"])))) / 1e6
     share = 100.0 * float(np.mean(total > period_ms))
     return (
         f"A good run stays below the frame period of {period_ms:.1f} ms; {share:.1f} % of the "
@@ -371,13 +372,13 @@ def _rate_words(timings: TimingTable, total: FloatArray) -> str:
     )
 
 
-def edge_plots(edges: EdgeTable | None, first_ns: int) -> list[Plot]:
+def edge_plots(edges: Table, first_ns: int) -> list[Plot]:
     """Return the chi-square of the edges over time, and its histogram."""
-    if edges is None or not np.any(np.isfinite(edges.chi2)):
+    if not edges or not np.any(np.isfinite(edges["chi2"])):
         reason = "Not drawn: the run has no edges with residuals."
         return [_plot(slug, text=reason) for slug in ("chi2", "chi2_histogram")]
     bound = chi2_bound(0.95)
-    n_refused = int(np.count_nonzero(~edges.is_accepted))
+    n_edges, n_refused = len(edges["chi2"]), int(np.count_nonzero(~edges["is_accepted"]))
     return [
         _plot(
             "chi2",
@@ -385,7 +386,7 @@ def edge_plots(edges: EdgeTable | None, first_ns: int) -> list[Plot]:
             f"optimized with its frame; values under {_FLOOR:g} are drawn there. A residual with "
             f"six degrees of freedom has mean {N_DOF}, and 95 % are under {bound:.1f}. "
             "These lie lower: the poses are fitted to the edges. Look for stretches near the "
-            f"bound and for refused edges: {n_refused} of {len(edges.chi2)} here.",
+            f"bound and for refused edges: {n_refused} of {n_edges} here.",
             figure=_dots(edges, first_ns, bound),
         ),
         _plot(
@@ -399,32 +400,32 @@ def edge_plots(edges: EdgeTable | None, first_ns: int) -> list[Plot]:
     ]
 
 
-def _is_free(edges: EdgeTable) -> Any:  # noqa: ANN401
+def _is_free(edges: Table) -> Any:  # noqa: ANN401
     """Tell which edges have a residual, are accepted and not the only one of their frame."""
-    _, inverse = np.unique(edges.stamps_ns, return_inverse=True)
-    n_accepted = np.bincount(inverse, weights=edges.is_accepted)[inverse]
-    return np.isfinite(edges.chi2) & edges.is_accepted & (n_accepted > 1)
+    _, inverse = np.unique(edges["stamp_ns"], return_inverse=True)
+    n_accepted = np.bincount(inverse, weights=edges["is_accepted"])[inverse]
+    return np.isfinite(edges["chi2"]) & edges["is_accepted"] & (n_accepted > 1)
 
 
-def _mean_words(edges: EdgeTable, bound: float) -> str:
+def _mean_words(edges: Table, bound: float) -> str:
     is_free, parts = _is_free(edges), []
     for kind in palette.LINKS:
-        values = edges.chi2[is_free & (edges.kinds == kind)]
+        values = edges["chi2"][is_free & (edges["kind"] == kind)]
         if len(values) > 0:
             above = 100.0 * float(np.mean(values > bound))
             parts.append(f"{kind}: mean {values.mean():.2g}, {above:.1f} % above {bound:.1f}")
     return f"Here: {'; '.join(parts)}." if parts else "No frame here has more than one edge."
 
 
-def _dots(edges: EdgeTable, first_ns: int, bound: float) -> Figure:
+def _dots(edges: Table, first_ns: int, bound: float) -> Figure:
     figure, axes = _time_axes(3.2, "chi-square [-]")
-    is_known = np.isfinite(edges.chi2)
-    x = elapsed(edges.stamps_ns, first_ns)
-    y = np.maximum(np.where(is_known, edges.chi2, 1.0), _FLOOR)
+    is_known = np.isfinite(edges["chi2"])
+    x = elapsed(edges["stamp_ns"], first_ns)
+    y = np.maximum(np.where(is_known, edges["chi2"], 1.0), _FLOOR)
     for kind, colour in palette.LINKS.items():
-        chosen = np.flatnonzero(is_known & edges.is_accepted & (edges.kinds == kind))
+        chosen = np.flatnonzero(is_known & edges["is_accepted"] & (edges["kind"] == kind))
         _scatter(axes, x[chosen], y[chosen], kind, ms=3.0, marker=_MARKERS[kind], color=colour)
-    refused = np.flatnonzero(is_known & ~edges.is_accepted)
+    refused = np.flatnonzero(is_known & ~edges["is_accepted"])
     label = f"refused ({len(refused)})"
     _scatter(axes, x[refused], y[refused], label, ms=6.0, marker="x", color=palette.REFUSED)
     axes.axhline(N_DOF, color="black", lw=1.0, ls=":", label="6: mean of 6 dof")
@@ -442,12 +443,12 @@ def _scatter(axes: Any, x: FloatArray, y: FloatArray, label: str, **looks: Any) 
         axes.plot(x, y, linestyle="", label=label, **looks)
 
 
-def _histogram(edges: EdgeTable, bound: float) -> Figure:
+def _histogram(edges: Table, bound: float) -> Figure:
     figure = new_figure(3.0)
     axes: Any = figure.subplots()
     is_free = _is_free(edges)
     for kind in palette.LINKS:
-        _draw_bars(axes, kind, edges.chi2[is_free & (edges.kinds == kind)])
+        _draw_bars(axes, kind, edges["chi2"][is_free & (edges["kind"] == kind)])
     grid = np.linspace(*_DECADES, 400)
     # density over the decimal logarithm
     density = chi2_density(10.0**grid) * 10.0**grid * np.log(10.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,8 @@ from gvo._text import number_text
 from gvo.config import Config
 from gvo.errors import TrajectoryError
 from gvo.frontend.calibration import describe_offsets
-from gvo.io.run_folder.reader import LoopTable, RunRecord, loop_words, verdict
+from gvo.io.run_folder.reader import RunRecord, Table, loop_ends
+from gvo.io.run_folder.verdict import loop_words, verdict
 from gvo.trajectory.alignment import AlignMode
 from gvo.trajectory.evaluation import Evaluation, consistency, evaluation_table, motions_of_chain
 from gvo.trajectory.trajectory import Trajectory
@@ -161,9 +163,9 @@ def write_run_report(
     compared, reason = _compare(record, estimates)
     with style():
         lines, world = _lines(record, estimates, compared)
-        if record.loops is not None and "global" in estimates:
+        if record.loops and "global" in estimates:
             shown = {"global": estimates["global"]} | {c.name: c.trajectory for c in compared}
-            lines += loop_lines(record.loops.lines_on(shown["global"]))
+            lines += loop_lines(loop_ends(record.loops, shown["global"]))
         drawn = [
             *_path_plots(lines, world),
             *_truth_plots(record, compared, reason),
@@ -236,7 +238,7 @@ def _covariance_plot(record: RunRecord, truth: Trajectory) -> Plot:
 
 
 def _first_ns(record: RunRecord) -> int:
-    stamps_ns = record.frames.stamps_ns
+    stamps_ns = record.frames["stamp_ns"]
     return int(stamps_ns[0]) if len(stamps_ns) > 0 else 0
 
 
@@ -265,18 +267,20 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> dict[str, An
     return {"header": header, "rows": rows} if rows else None
 
 
-def _loops(loops: LoopTable | None, first_ns: int) -> dict[str, Any] | None:
+def _loops(loops: Table, first_ns: int) -> dict[str, Any] | None:
     """Return the table of loops; of many, some all over the run."""
-    if loops is None or not loops.reasons:
+    if not loops or not len(loops["reason"]):
         return None
-    n = len(loops.reasons)
+    n = len(loops["reason"])
     chosen = evenly(n, _MAX_LOOPS)
-    ends = (elapsed(stamps_ns, first_ns) for stamps_ns in (loops.stamps_ns, loops.reference_ns))
+    ends = (
+        elapsed(stamps_ns, first_ns) for stamps_ns in (loops["stamp_ns"], loops["reference_ns"])
+    )
     columns = (
         *([f"{end_s:.1f}" for end_s in each] for each in ends),
-        [str(count) for count in loops.n_inliers],
-        [number_text(float(residual)) for residual in loops.residuals],
-        loops.reasons,
+        [str(count) for count in loops["n_inliers"]],
+        [number_text(float(residual)) for residual in loops["residual"]],
+        loops["reason"],
     )
     rows = [[column[index] for column in columns] for index in chosen]
     rest = f"; {n - len(chosen)} more are in loops.csv" if n > len(chosen) else ""
@@ -296,13 +300,13 @@ def _nees_row(row: Mapping[str, Any]) -> list[str]:
 
 def _facts(record: RunRecord) -> dict[str, str]:
     summary, frames = record.summary, record.frames
-    statuses = {status: frames.statuses.count(status) for status in dict.fromkeys(frames.statuses)}
+    statuses = Counter(frames["status"])
     coverage, memory = summary.get("coverage_percent"), summary.get("peak_memory_mb")
     version = summary.get("gvo_version")
     return {
         "Sensor": str(summary.get("sensor", "")),
         "Poses of": str(summary.get("base_frame", "")),
-        "Frames": str(len(frames.stamps_ns)),
+        "Frames": str(len(frames["stamp_ns"])),
         "Duration": _duration(record),
         "Coverage": "" if coverage is None else f"{float(coverage):.1f} % of the frames tracked",
         "Segments": _segment_words(summary.get("segments", ())),
@@ -327,7 +331,7 @@ def _segment_words(segments: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _duration(record: RunRecord) -> str:
-    stamps_ns = np.unique(record.frames.stamps_ns)  # repeated ones are skipped
+    stamps_ns = np.unique(record.frames["stamp_ns"])  # repeated ones are skipped
     if len(stamps_ns) < 2:
         return ""
     rate = 1e9 / float(np.median(np.diff(stamps_ns)))

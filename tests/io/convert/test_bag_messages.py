@@ -19,7 +19,7 @@ from gvo.io.convert.bag_messages import (
     write_camera_info,
     write_transforms,
 )
-from gvo.io.convert.bag_writer import write_bag
+from gvo.io.convert.convert import convert
 from gvo.io.images import encode_image
 from gvo.io.opening import open_recording
 from tests.io.conftest import Item, Tiny
@@ -86,7 +86,7 @@ def _messages(path: Path, topic: str) -> list[Any]:
 def test_png_images_are_as_decoded(tiny: Tiny, tmp_path: Path, name: str, is_color: bool) -> None:
     images = [tiny.texture(n, is_color=is_color) for n in range(4)]
     items: list[Item] = [(n % 2, 10 + n // 2, pixels) for n, pixels in enumerate(images)]
-    write_bag(tiny.stereo(items), tmp_path / name, compress=True)
+    convert(tiny.stereo(items), tmp_path / name, compress=True)
     for side, mine in (("left", images[::2]), ("right", images[1::2])):
         messages = _messages(tmp_path / name, f"/stereo/{side}/image_rect/compressed")
         for message, pixels in zip(messages, mine, strict=True):
@@ -112,7 +112,7 @@ def test_depth_comes_back_whatever_later_images_hold(tiny: Tiny, tmp_path: Path,
         for n, depth in enumerate(depths)
         for item in ((0, 10 + n, tiny.texture(n)), (1, 10 + n, depth))
     ]
-    assert write_bag(tiny.rgbd(items), tmp_path / name, compress=True).skipped == ()
+    assert convert(tiny.rgbd(items), tmp_path / name, compress=True).skipped == ()
     read = [image.load() for image in open_recording(tmp_path / name).images() if image.stream]
     for depth, expected in zip(read, depths, strict=True):
         np.testing.assert_array_equal(depth, expected)
@@ -128,7 +128,7 @@ def test_depth_comes_back_whatever_later_images_hold(tiny: Tiny, tmp_path: Path,
 def test_depth_not_of_millimetres_stays_as_it_is(tiny: Tiny, tmp_path: Path, name: str) -> None:
     fault = RecordingError("depth.png: damaged")
     items: list[Item] = [(0, 1, tiny.texture(0)), (1, 1, fault), (0, 2, tiny.texture(1))]
-    write_bag(tiny.rgbd([*items, (1, 2, tiny.depth(0))]), tmp_path / name, compress=True)
+    convert(tiny.rgbd([*items, (1, 2, tiny.depth(0))]), tmp_path / name, compress=True)
     (message,) = _messages(tmp_path / name, "/camera/depth/image")
     assert message.encoding == "32FC1"
 

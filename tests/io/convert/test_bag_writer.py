@@ -16,7 +16,7 @@ from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.geometry.camera import Calibration, PinholeCamera
 from gvo.geometry.se3 import make_transform
-from gvo.io.convert.bag_writer import write_bag
+from gvo.io.convert.convert import convert
 from gvo.io.frames import frames
 from gvo.io.opening import open_recording
 from gvo.io.recording import Source
@@ -111,7 +111,7 @@ def _assert_same(source: Source, copy: Source) -> None:
     ids=["rectified stereo", "raw stereo", "ideal rgbd", "raw rgbd"],
 )
 def test_what_is_read_back_is_the_recording(tmp_path: Path, name: str, source: Source) -> None:
-    conversion = write_bag(source, tmp_path / name)
+    conversion = convert(source, tmp_path / name)
     _assert_same(source, open_recording(tmp_path / name))
     assert conversion.n_images == 8
     assert conversion.skipped == ()
@@ -120,7 +120,7 @@ def test_what_is_read_back_is_the_recording(tmp_path: Path, name: str, source: S
 
 @pytest.mark.parametrize("source", [_stereo(*_raw_pair()), _rgbd(_raw_pair()[0])])
 def test_rectified_copies_hold_the_same_frames(tmp_path: Path, source: Source) -> None:
-    write_bag(source, tmp_path / "a.bag", rectify=True)
+    convert(source, tmp_path / "a.bag", rectify=True)
     copy = open_recording(tmp_path / "a.bag")
     assert all(calibration.is_rectified for calibration in copy.info.calibrations)
     assert _fingerprints(copy) == _fingerprints(source)
@@ -130,7 +130,7 @@ def test_rectified_copies_hold_the_same_frames(tmp_path: Path, source: Source) -
 
 @_KINDS
 def test_another_reader_finds_the_topics_and_the_stamps(tmp_path: Path, name: str) -> None:
-    write_bag(_stereo(truth=_truth(20)), tmp_path / name)
+    convert(_stereo(truth=_truth(20)), tmp_path / name)
     path = tmp_path / name
     with AnyReader([path]) as reader:
         assert {topic: info.msgtype for topic, info in reader.topics.items()} == {
@@ -161,7 +161,7 @@ def test_stamps_are_exact_to_the_nanosecond(
 ) -> None:
     path = tmp_path_factory.mktemp("stamps") / name
     items: list[Item] = [(stream, s, _noise(1)) for s in stamps for stream in (0, 1)]
-    write_bag(ListSource("stereo", items, calibrations=_stereo().info.calibrations), path)
+    convert(ListSource("stereo", items, calibrations=_stereo().info.calibrations), path)
     assert [image.stamp_ns for image in open_recording(path).images()] == [
         stamp_ns for stamp_ns in stamps for _ in range(2)
     ]
@@ -172,7 +172,7 @@ def test_frames_whose_stamps_go_back_or_repeat_stay_faulty(tmp_path: Path, name:
     stamps = [10, 30, 20, 40, 40, 50]
     items: list[Item] = [(s, stamp, _noise(n)) for n, stamp in enumerate(stamps) for s in (0, 1)]
     source = ListSource("stereo", items, calibrations=_stereo().info.calibrations)
-    write_bag(source, tmp_path / name)
+    convert(source, tmp_path / name)
     copy = _fingerprints(open_recording(tmp_path / name))
     assert copy == _fingerprints(source)
     assert [item[1] for item in copy if item[0] == "faulty"] == [20, 40]
@@ -181,7 +181,7 @@ def test_frames_whose_stamps_go_back_or_repeat_stay_faulty(tmp_path: Path, name:
 def test_an_image_that_cannot_be_read_is_left_out_and_named(tmp_path: Path) -> None:
     items: list[Item] = [(s, stamp, _noise(s)) for stamp in (10, 20) for s in (0, 1)]
     items[2] = (0, 20, RecordingError("a.png: damaged"))
-    conversion = write_bag(
+    conversion = convert(
         ListSource("stereo", items, calibrations=_stereo().info.calibrations), tmp_path / "a.bag"
     )
     assert conversion.n_images == 3
@@ -190,16 +190,16 @@ def test_an_image_that_cannot_be_read_is_left_out_and_named(tmp_path: Path) -> N
 
 def test_progress_is_told(tmp_path: Path) -> None:
     told: list[int] = []
-    write_bag(_stereo(n=2), tmp_path / "a.bag", progress=told.append)
+    convert(_stereo(n=2), tmp_path / "a.bag", progress=told.append)
     assert told == [1, 2, 3, 4]
 
 
 @_KINDS
 def test_nothing_is_overwritten(tmp_path: Path, name: str) -> None:
-    write_bag(_stereo(), tmp_path / name)
+    convert(_stereo(), tmp_path / name)
     before = _fingerprints(open_recording(tmp_path / name))
     with pytest.raises(RecordingError, match=f"{name}: exists already"):
-        write_bag(_stereo(n=1), tmp_path / name)
+        convert(_stereo(n=1), tmp_path / name)
     assert _fingerprints(open_recording(tmp_path / name)) == before
 
 
@@ -208,7 +208,7 @@ def test_nothing_is_left_behind_where_writing_fails(tmp_path: Path, name: str) -
     items: list[Item] = [(0, 5, _noise(1)), (1, 5, _noise(2)), (0, -1, _noise(3))]
     source = ListSource("stereo", items, calibrations=_stereo().info.calibrations)
     with pytest.raises(RecordingError, match="the stamp -1 ns cannot be written"):
-        write_bag(source, tmp_path / name)
+        convert(source, tmp_path / name)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -221,14 +221,14 @@ def test_a_folder_that_may_not_be_written_is_told_in_words(
     monkeypatch.setattr("tempfile.TemporaryDirectory", forbid)
     path = tmp_path / "a.bag"
     with pytest.raises(RecordingError, match=f"^{path}: cannot be written: Permission denied$"):
-        write_bag(_stereo(), path)
+        convert(_stereo(), path)
 
 
 def test_other_suffixes_and_missing_folders_are_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"\.bag, \.mcap or \.db3.* got \.zip"):
-        write_bag(_stereo(), tmp_path / "a.zip")
+        convert(_stereo(), tmp_path / "a.zip")
     with pytest.raises(RecordingError, match="none is no folder"):
-        write_bag(_stereo(), tmp_path / "none" / "a.bag")
+        convert(_stereo(), tmp_path / "none" / "a.bag")
 
 
 def _transforms(path: Path, topic: str) -> list[tuple[int, str, str, NDArray[np.float64]]]:
@@ -250,7 +250,7 @@ def test_the_cameras_stand_in_tf_before_the_first_image(tmp_path: Path, name: st
     source = _stereo(*_raw_pair(), truth=_truth(3))
     T_body_cam = make_transform(_raw_pair()[1].R, np.array([0.3, -0.2, 0.1]))
     source.info = replace(source.info, T_body_cam=T_body_cam, frame_id="cam_left")
-    write_bag(source, tmp_path / name)
+    convert(source, tmp_path / name)
     body, right = _transforms(tmp_path / name, "/tf_static")
     assert body[1:3] == ("body", "cam_left")
     np.testing.assert_allclose(body[3], T_body_cam, atol=1e-15)
@@ -273,7 +273,7 @@ def test_the_cameras_stand_in_tf_before_the_first_image(tmp_path: Path, name: st
 def test_images_and_their_calibration_name_one_frame(tmp_path: Path, name: str) -> None:
     source = _stereo()
     source.info = replace(source.info, frame_id="camera_right_optical")
-    write_bag(source, tmp_path / name)
+    convert(source, tmp_path / name)
     frames_of: dict[str, set[str]] = {}
     with AnyReader([tmp_path / name]) as reader:
         for connection, _, data in reader.messages():
@@ -291,8 +291,8 @@ def test_a_copy_of_a_bag_keeps_the_frame_and_the_body(tmp_path: Path) -> None:
     source = _stereo()
     T_body_cam = make_transform(_raw_pair()[0].R, np.array([0.3, -0.2, 0.1]))
     source.info = replace(source.info, T_body_cam=T_body_cam, frame_id="left_eye")
-    write_bag(source, tmp_path / "a.bag")
-    write_bag(open_recording(tmp_path / "a.bag"), tmp_path / "b.mcap")
+    convert(source, tmp_path / "a.bag")
+    convert(open_recording(tmp_path / "a.bag"), tmp_path / "b.mcap")
     assert open_recording(tmp_path / "b.mcap").info.frame_id == "left_eye"
     body, _ = _transforms(tmp_path / "b.mcap", "/tf_static")
     np.testing.assert_allclose(body[3], T_body_cam, atol=1e-15)

@@ -17,8 +17,8 @@ from gvo.config import Config
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry.camera import Calibration, rectification_maps
 from gvo.geometry.se3 import make_transform
-from gvo.io.convert.bag_writer import write_bag
-from gvo.io.convert.convert import Layout, write_folder
+from gvo.io.bag.source import BagSource
+from gvo.io.convert.convert import Conversion, Layout, convert
 from gvo.io.frames import frames
 from gvo.io.opening import RecordingOptions, open_recording
 from gvo.io.recording import DepthView, Source, StampedImage
@@ -34,6 +34,13 @@ _LENSES = {
     "rational_polynomial": ([0.4, 0.1, 1e-4, -2e-4, 0.01, 0.7, 0.2, 0.02], "rational_polynomial"),
     "equidistant": ([-0.01, 0.02, -0.005, 0.001], "equidistant"),
 }
+
+
+def write_folder(source: Source, path: Path, **options: Any) -> Conversion:
+    """Write a folder in the layout that fits best, also of what is no bag."""
+    if not isinstance(source, BagSource):
+        options = {"layout": "tum" if source.info.sensor == "rgbd" else "kitti"} | options
+    return convert(source, path, **options)
 
 
 class _Damaged(ListSource):
@@ -125,7 +132,7 @@ def _assert_same_truth(copy: Source, source: Source, *, atol: float) -> None:
 @pytest.mark.parametrize("cameras", [(0, 1), (2, 3)], ids=["grey", "colour"])
 def test_kitti_comes_back_from_a_bag(tiny: Tiny, tmp_path: Path, cameras: tuple[int, int]) -> None:
     origin = tiny.write_kitti(tmp_path / "origin", n_frames=4, cameras=cameras)
-    write_bag(open_recording(origin), tmp_path / "a.bag")
+    convert(open_recording(origin), tmp_path / "a.bag")
     written = write_folder(open_recording(tmp_path / "a.bag"), tmp_path / "copy")
     source, copy = open_recording(origin), open_recording(tmp_path / "copy")
     assert (written.n_images, written.n_poses, written.skipped) == (8, 4, ())
@@ -147,7 +154,7 @@ def test_kitti_comes_back_from_a_bag(tiny: Tiny, tmp_path: Path, cameras: tuple[
 @pytest.mark.parametrize("name", ["a.bag", "a.mcap"])
 def test_euroc_comes_back_from_a_bag(tiny: Tiny, tmp_path: Path, model: str, name: str) -> None:
     source = open_recording(_write_euroc(tiny, tmp_path / "origin", model))
-    write_bag(source, tmp_path / name)
+    convert(source, tmp_path / name)
     write_folder(open_recording(tmp_path / name), tmp_path / "copy")
     copy = open_recording(tmp_path / "copy")
     assert source.info.calibrations[0].model == _LENSES[model][1]
@@ -200,7 +207,7 @@ def test_tum_comes_back_from_a_bag_as_it_was(tiny: Tiny, tmp_path: Path) -> None
         distortion_coefficients={"rows": 1, "cols": 5, "data": [0.26, -0.95, -0.005, 0.0026, 1.16]}
     )
     (origin / "calibration.yaml").write_text(yaml.safe_dump(camera))
-    write_bag(open_recording(origin), tmp_path / "a.mcap")
+    convert(open_recording(origin), tmp_path / "a.mcap")
     written = write_folder(open_recording(tmp_path / "a.mcap"), tmp_path / "copy")
     source, copy = open_recording(origin), open_recording(tmp_path / "copy")
     assert (written.n_images, written.n_poses, written.skipped) == (6, 4, ())
@@ -266,7 +273,7 @@ def test_depth_of_another_camera_is_registered_on_writing(
     tiny: Tiny, tmp_path: Path, is_raw: bool, target: str
 ) -> None:
     source = _with_depth_view(tiny, is_raw=is_raw)
-    write: Any = write_folder if target == "tum" else write_bag
+    write: Any = write_folder if target == "tum" else convert
     write(source, tmp_path / target)
     copy = open_recording(tmp_path / target)
     assert copy.info.depth_view is None
@@ -287,7 +294,7 @@ def test_depth_of_a_camera_with_other_raw_intrinsics_stays(tiny: Tiny, tmp_path:
     calibration = replace(Calibration.from_camera(tiny.camera), K=K)
     source = tiny.rgbd(_rgbd_items(tiny), calibrations=(calibration,))
     for name in ("a.bag", "tum"):
-        write: Any = write_folder if name == "tum" else write_bag
+        write: Any = write_folder if name == "tum" else convert
         write(source, tmp_path / name)
         copy = open_recording(tmp_path / name)
         assert copy.info.depth_view is None
@@ -310,7 +317,7 @@ def test_positions_without_rotations_are_told(tiny: Tiny, tmp_path: Path, target
     positions = Trajectory.of_positions(truth.stamps_ns, truth.positions)
     source = _source_for(tiny, target, positions)
     path = tmp_path / target
-    written = write_bag(source, path) if target == "a.bag" else write_folder(source, path)
+    written = convert(source, path) if target == "a.bag" else write_folder(source, path)
     assert written.n_poses == 0
     assert written.n_images == 6
     assert written.skipped == (
@@ -327,7 +334,7 @@ def test_what_precedes_damage_is_kept_and_told(tiny: Tiny, tmp_path: Path, targe
     )
     path = tmp_path / target
     is_bag = target.startswith("a.")
-    written = write_bag(source, path) if is_bag else write_folder(source, path)
+    written = convert(source, path) if is_bag else write_folder(source, path)
     assert written.skipped == ("a.bag: 40 % are missing at its end",)
     assert (written.n_images, written.n_poses) == (6, 3)
     _assert_same_images(open_recording(path), whole)
@@ -339,7 +346,7 @@ def test_unreadable_truth_does_not_cost_the_images(tiny: Tiny, tmp_path: Path, t
     source = _Damaged("stereo", _pairs(tiny), calibrations=tiny.stereo([]).info.calibrations)
     source.truth_fault = "data.csv:7: expected 8 numbers"
     path = tmp_path / target
-    written = write_bag(source, path) if target == "a.bag" else write_folder(source, path)
+    written = convert(source, path) if target == "a.bag" else write_folder(source, path)
     assert "ground truth: data.csv:7: expected 8 numbers" in written.skipped
     assert (written.n_images, written.n_poses) == (6, 0)
 
@@ -351,7 +358,7 @@ def test_without_an_image_nothing_is_left_behind(tiny: Tiny, tmp_path: Path, tar
     source = tiny.stereo([*items, (1, 2, fault)])
     path = tmp_path / target
     with pytest.raises(RecordingError, match=r"list: no right image can be written: .*empty"):
-        write_bag(source, path) if target == "a.bag" else write_folder(source, path)
+        convert(source, path) if target == "a.bag" else write_folder(source, path)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -438,7 +445,7 @@ def test_layouts_that_do_not_fit_the_sensor_are_refused(tiny: Tiny, tmp_path: Pa
 
 def test_body_and_calibration_of_a_file_are_written(tiny: Tiny, tmp_path: Path) -> None:
     origin = _write_euroc(tiny, tmp_path / "origin", "radial-tangential")
-    write_bag(open_recording(origin), tmp_path / "a.bag")
+    convert(open_recording(origin), tmp_path / "a.bag")
     options = RecordingOptions(calibration=[origin])
     write_folder(open_recording(tmp_path / "a.bag", options=options), tmp_path / "copy")
     np.testing.assert_allclose(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gvo.errors import GvoError, RecordingError, TrajectoryError
-from gvo.io.run_folder.reader import RunRecord, read_run
+from gvo.io.run_folder.reader import RunRecord, loop_ends, read_run
 from gvo.io.synthetic import SyntheticRecording
 from gvo.runs.run import run_recording
 from gvo.trajectory.formats import read_covariances, read_trajectory
@@ -40,13 +40,10 @@ def test_a_folder_is_read_as_its_files_say(folder: Path) -> None:
         np.testing.assert_allclose(trajectory.T_world_frame, other.T_world_frame, atol=1e-12)
         assert trajectory.covariances is not None
         np.testing.assert_array_equal(trajectory.covariances, covariances)
-    assert record.frames.statuses == ("ok",) * N
-    assert record.edges is not None
-    assert len(record.edges.chi2) == len((folder / "edges.csv").read_text().splitlines()) - 1
-    assert record.timings is not None
-    assert [*record.timings.stages_ms] == [
-        *("read", "extract", "register", "links", "window", "loops"),
-    ]
+    assert record.frames["status"].tolist() == ["ok"] * N
+    assert len(record.edges["chi2"]) == len((folder / "edges.csv").read_text().splitlines()) - 1
+    stages = ("read", "extract", "register", "links", "window", "loops")
+    assert [*record.timings] == ["stamp_ns", *(f"{stage}_ms" for stage in stages)]
     assert record.truth is not None
 
 
@@ -67,9 +64,9 @@ def _part(record: RunRecord, name: str) -> Sized:
     parts: dict[str, Sized] = {
         "causal.txt": record.trajectories["causal"].stamps_ns,
         "causal_covariance.csv": record.trajectories["causal"].stamps_ns,
-        "frames.csv": record.frames.stamps_ns,
-        "edges.csv": () if record.edges is None else record.edges.stamps_ns,
-        "timings.csv": () if record.timings is None else record.timings.stamps_ns,
+        "frames.csv": record.frames.get("stamp_ns", ()),
+        "edges.csv": record.edges.get("stamp_ns", ()),
+        "timings.csv": record.timings.get("stamp_ns", ()),
     }
     return parts[name]
 
@@ -82,16 +79,18 @@ def test_loops_are_lines_between_their_poses(copy: Path) -> None:
     header = "stamp_ns,reference_ns,n_inliers,residual,reason"
     (copy / "loops.csv").write_text("\n".join([header, *table, ""]))
     loops = read_run(copy).loops
-    assert loops is not None
-    assert loops.reasons == ("", "odd", "")
-    assert loops.n_inliers.tolist() == [9, 9, 9]
-    lines, at = loops.lines_on(trajectory), trajectory.positions
+    assert loops["reason"].tolist() == ["", "odd", ""]
+    assert loops["n_inliers"].tolist() == [9, 9, 9]
+    lines, at = loop_ends(loops, trajectory), trajectory.positions
     np.testing.assert_array_equal(lines["loops"], [at[[1, 5]], at[[2, 5]]])
     np.testing.assert_array_equal(lines["refused loops"], [at[[0, 4]]])
     # Up to the fifth frame.
-    until = loops.lines_on(trajectory.select(slice(0, 5)))
+    until = loop_ends(loops, trajectory.select(slice(0, 5)))
     assert {name: len(ends) for name, ends in until.items()} == {"loops": 0, "refused loops": 1}
-    assert [len(ends) for ends in loops.lines_on(trajectory.select(slice(0, 0))).values()] == [0, 0]
+    assert [len(ends) for ends in loop_ends(loops, trajectory.select(slice(0, 0))).values()] == [
+        0,
+        0,
+    ]
 
 
 def test_smoothed_poses_may_come_in_any_order(copy: Path) -> None:
@@ -109,10 +108,13 @@ def test_a_folder_of_smoothed_edges_has_no_tables_of_edges_and_times(copy: Path)
         "stamp_ns,frame_id,status,n_edges,n_rejected,reason\n5,a,ok,2,1,\n"
     )
     record = read_run(copy)
-    assert (record.edges, record.timings, record.truth) == (None, None, None)
-    assert {name: [*counts] for name, counts in record.frames.counts.items()} == {
-        "edges": [2],
-        "rejected": [1],
+    assert (record.edges, record.timings, record.truth) == ({}, {}, None)
+    assert {name: values.tolist() for name, values in record.frames.items()} == {
+        "stamp_ns": [5],
+        "status": ["ok"],
+        "n_edges": [2],
+        "n_rejected": [1],
+        "reason": [""],
     }
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from gvo.io.run_folder.reader import loop_words, verdict
+from gvo.io.run_folder.verdict import loop_words, verdict
 
 
 def row(nees: float, *, error_m: float = 0.05, motion: str = "window over 1 s") -> dict[str, Any]:

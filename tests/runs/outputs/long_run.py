@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gvo.geometry.se3 import make_transform
-from gvo.io.run_folder.reader import EdgeTable, FrameTable, RunRecord, TimingTable
+from gvo.io.run_folder.reader import RunRecord
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import IntArray
 
@@ -37,7 +37,7 @@ def make_long_run(folder: Path, n_frames: int) -> RunRecord:
     stamps_ns: IntArray = 1_700_000_000_000_000_000 + 100_000_000 * np.arange(n_frames)
     is_lost = np.arange(n_frames) % 997 == 500
     counts = {
-        name: rng.poisson(mean, n_frames).astype(np.int64)
+        f"n_{name}": rng.poisson(mean, n_frames).astype(np.int64)
         for name, mean in zip(
             ("keypoints", "points", "matches", "inliers", "links"),
             (800, 600, 300, 250, 3),
@@ -49,23 +49,24 @@ def make_long_run(folder: Path, n_frames: int) -> RunRecord:
     return RunRecord(
         folder=folder,
         summary={},
-        frames=FrameTable(
-            stamps_ns=stamps_ns,
-            statuses=tuple(np.where(is_lost, "lost", "ok").tolist()),
-            counts=counts,
-            reasons=tuple(np.where(is_lost, "too few matches", "").tolist()),
-        ),
-        edges=EdgeTable(
-            stamps_ns=np.repeat(stamps_ns[1:], 3),
-            reference_ns=references,
-            kinds=np.tile(np.array(["step", "keyframe", "keyframe"]), n_frames - 1),
-            is_accepted=rng.random(len(references)) > 0.02,
-            chi2=rng.chisquare(6, len(references)),
-        ),
-        loops=None,
-        timings=TimingTable(
-            stamps_ns=stamps_ns, stages_ms={name: rng.gamma(8.0, 0.5, n_frames) for name in STAGES}
-        ),
+        frames={
+            "stamp_ns": stamps_ns,
+            "status": np.where(is_lost, "lost", "ok").astype(np.object_),
+            "reason": np.where(is_lost, "too few matches", "").astype(np.object_),
+            **counts,
+        },
+        edges={
+            "stamp_ns": np.repeat(stamps_ns[1:], 3),
+            "reference_ns": references,
+            "kind": np.tile(np.array(["step", "keyframe", "keyframe"]), n_frames - 1),
+            "is_accepted": rng.random(len(references)) > 0.02,
+            "chi2": rng.chisquare(6, len(references)),
+        },
+        loops={},
+        timings={
+            "stamp_ns": stamps_ns,
+            **{f"{name}_ms": rng.gamma(8.0, 0.5, n_frames) for name in STAGES},
+        },
         trajectories={
             name: _trajectory(stamps_ns, rng, noise_m=noise, has_covariances=True)
             for name, noise in has_all.items()

@@ -1,16 +1,18 @@
-"""What conversions of recordings share."""
+"""What all forms in which a recording is written share."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gvo.config import SyncConfig
 from gvo.errors import GvoError, RecordingError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
@@ -25,31 +27,7 @@ BODY_FRAME = "body"
 """Name in tf of what the calibration of a data set places its cameras on."""
 
 _N_NAMED = 5
-_Calibrations: TypeAlias = tuple[Calibration, ...]
 _Preparers: TypeAlias = tuple[ImagePreparer | None, ImagePreparer | None]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Conversion:
-    """What a conversion wrote.
-
-    Parameters
-    ----------
-    path : Path
-        The new bag or folder.
-    n_images : int
-        Images written, of both streams.
-    n_poses : int
-        Poses of the ground truth written.
-    skipped : tuple of str
-        What was left out and why, a line each: an image, the ground truth, the rest of a
-        recording that cannot be read on.
-    """
-
-    path: Path
-    n_images: int
-    n_poses: int
-    skipped: tuple[str, ...]
 
 
 class LeftOut:
@@ -79,32 +57,68 @@ class LeftOut:
         return (*self._lines, *rest)
 
 
-def check_new(path: Path) -> None:
-    """Refuse a target that exists, or whose folder does not.
+class Options(NamedTuple):
+    """How a recording is written: rectified, images of bags as PNG, what a pair is."""
 
-    Raises
-    ------
-    RecordingError
-        With what to do.
+    rectify: bool
+    compress: bool
+    sync: SyncConfig
+
+
+class Target(AbstractContextManager["Target"], ABC):
+    """A new bag or folder: takes images one by one inside a `with` block, in the end `finish`.
+
+    Attributes
+    ----------
+    path : Path
+        The file or folder.
+    n_images : list of two int
+        Images written, by stream.
+    n_poses : int
+        True poses written, once it is finished.
     """
-    if path.exists():
-        raise RecordingError(f"{path}: exists already; give another path or remove it")
-    if not path.parent.is_dir():
-        raise RecordingError(f"{path}: cannot be written: {path.parent} is no folder")
 
+    def __init__(self, path: Path, source: Source, left_out: LeftOut, options: Options) -> None:
+        self.path, self.left_out, self.info = path, left_out, source.info
+        self.n_images, self.n_poses = [0, 0], 0
+        self.names = tuple(f"{name} image" for name in self.info.stream_names)
+        self.calibrations, self.preparers = plan_images(self.info, rectify=options.rectify)
+        self.truth = _true_poses(source, left_out)
 
-def check_images(n_images: tuple[int, int], source: Source, left_out: LeftOut) -> None:
-    """Check that there are images of both streams, as every reader needs.
+    def __exit__(self, *exception: object) -> None:
+        """Close what is open."""
 
-    Raises
-    ------
-    RecordingError
-        When no image of a stream was written.
-    """
-    if not all(n_images):
-        name = source.info.stream_names[0 if n_images[0] == 0 else 1]
-        reason = "; ".join(left_out.lines()[:1]) or "the recording holds none"
-        raise RecordingError(f"{source.info.name}: no {name} image can be written: {reason}")
+    def select(self, images: Iterator[StampedImage]) -> Iterator[StampedImage]:
+        """Yield the images that the form can hold: those with a stamp of their own."""
+        last_ns: list[int | None] = [None, None]
+        for image in images:
+            before_ns = last_ns[image.stream]
+            if before_ns is not None and image.stamp_ns <= before_ns:
+                reason = f"the stamp does not advance from {before_ns} ns"
+                self.left_out.add_image(self.names[image.stream], image.stamp_ns, reason)
+                continue
+            last_ns[image.stream] = image.stamp_ns
+            yield image
+
+    def add(self, image: StampedImage) -> None:
+        """Write an image; note where it cannot be read."""
+        prepare = self.preparers[image.stream]
+        try:
+            pixels = image.load()
+            pixels = pixels if prepare is None else prepare(pixels)
+        except RecordingError as error:
+            self.left_out.add_image(self.names[image.stream], image.stamp_ns, str(error))
+            return
+        self.write(image, pixels)
+        self.n_images[image.stream] += 1
+
+    @abstractmethod
+    def write(self, image: StampedImage, pixels: NDArray[Any]) -> None:
+        """Write the pixels of an image."""
+
+    @abstractmethod
+    def finish(self) -> None:
+        """Write what is known at the end: calibrations, tables, true poses."""
 
 
 def readable_images(source: Source, left_out: LeftOut) -> Iterator[StampedImage]:
@@ -115,7 +129,7 @@ def readable_images(source: Source, left_out: LeftOut) -> Iterator[StampedImage]
         left_out.add(str(error))
 
 
-def true_poses(source: Source, left_out: LeftOut) -> Trajectory | None:
+def _true_poses(source: Source, left_out: LeftOut) -> Trajectory | None:
     """Return T_world_cam of the rectified first camera; None, with a note, if not poses."""
     try:
         truth = source.ground_truth()
@@ -130,21 +144,12 @@ def true_poses(source: Source, left_out: LeftOut) -> Trajectory | None:
     return truth
 
 
-def plan_images(info: RecordingInfo, *, rectify: bool) -> tuple[_Calibrations, _Preparers]:
-    """Decide how the images of a recording are written.
+def plan_images(
+    info: RecordingInfo, *, rectify: bool
+) -> tuple[tuple[Calibration, ...], _Preparers]:
+    """Return the calibrations of the images as written, and what makes them of those read.
 
-    Parameters
-    ----------
-    info : RecordingInfo
-        Depth of a camera of its own is moved to the rectified colour image.
-    rectify : bool
-        Write raw images rectified and grey.
-
-    Returns
-    -------
-    calibrations : tuple of Calibration
-        Of the images that are written.
-    preparers : tuple of two ImagePreparer, or None where the images stay as they are
+    Depth of a camera of its own is moved to the rectified colour image.
     """
     is_raw = not info.calibrations[0].is_rectified
     is_moved = info.depth_view is not None
@@ -161,18 +166,6 @@ def plan_images(info: RecordingInfo, *, rectify: bool) -> tuple[_Calibrations, _
     return tuple(ideal), preparers
 
 
-def load_image(
-    image: StampedImage, prepare: ImagePreparer | None, name: str, left_out: LeftOut
-) -> NDArray[Any] | None:
-    """Return the pixels to write; None, with a note, where they cannot be read."""
-    try:
-        pixels = image.load()
-        return pixels if prepare is None else prepare(pixels)
-    except RecordingError as error:
-        left_out.add_image(name, image.stamp_ns, str(error))
-        return None
-
-
 def pose_of_right(info: RecordingInfo) -> FloatArray:
     """Return T_left_right of the rectified cameras of a stereo pair, shape (4, 4), metres."""
     left, right = info.calibrations
@@ -181,18 +174,7 @@ def pose_of_right(info: RecordingInfo) -> FloatArray:
 
 
 def pose_on_body(source: Source) -> FloatArray | None:
-    """Return where the camera sits on the body of its calibration.
-
-    Parameters
-    ----------
-    source : Source
-        Whose `T_body_cam` counts; of a bag also what tf calls `body`.
-
-    Returns
-    -------
-    ndarray of float64, shape (4, 4), or None
-        T_body_cam of the rectified left or colour camera, metres.
-    """
+    """Return T_body_cam of the rectified first camera, metres: of the calibration, or of tf."""
     info = source.info
     if info.T_body_cam is not None or not isinstance(source, BagSource) or not info.frame_id:
         return info.T_body_cam

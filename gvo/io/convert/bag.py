@@ -1,0 +1,198 @@
+"""Recordings written as bags."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvo.errors import RecordingError
+from gvo.geometry.camera import Calibration
+from gvo.io.convert import bag_messages
+from gvo.io.convert.bag_messages import BagWriter, FramePose, Header
+from gvo.io.convert.target import (
+    BODY_FRAME,
+    LeftOut,
+    Options,
+    Target,
+    plan_images,
+    pose_of_right,
+    pose_on_body,
+    readable_images,
+)
+from gvo.io.images import MILLIMETRES, exact_counts
+from gvo.io.poses.truth import TRUTH_FRAMES
+from gvo.io.recording import RecordingInfo, Source, StampedImage
+from gvo.types import FloatArray
+
+BagStreams: TypeAlias = tuple["BagStream", "BagStream"]
+
+
+class BagStream(NamedTuple):
+    """Where one stream of a recording goes.
+
+    Parameters
+    ----------
+    topic : str
+        Of its images, without the suffix of a transport.
+    frame_id : str
+        Of images and `CameraInfo`: the optical frame of the rectified camera.
+    calibration : Calibration
+        Of the images as they are written.
+    is_compressed : bool
+        Written as PNG.
+    """
+
+    topic: str
+    frame_id: str
+    calibration: Calibration
+    is_compressed: bool
+
+    @property
+    def info_topic(self) -> str:
+        """Of its `CameraInfo`."""
+        return f"{self.topic.rpartition('/')[0]}/camera_info"
+
+
+class BagTarget(Target):
+    """A bag, whose frames are those of the recording, bit by bit.
+
+    A stereo pair becomes `/stereo/left/image_rect` and `/stereo/right/image_rect`, or `image_raw`
+    where it is not rectified; an RGB-D camera becomes `/camera/rgb/image_rect_color`, or
+    `image_color`, and `/camera/depth/image` in metres (32FC1, NaN = unknown). Each image has a
+    `CameraInfo` of its stamp beside it. The ground truth is written to `/tf`: `world` to
+    `ground_truth`, the pose of the rectified camera. `/tf_static` holds the right camera in the
+    left one, and both in `body` where the recording says where they sit there; the frames are
+    those of the rectified cameras, also beside raw images.
+    """
+
+    def __init__(self, path: Path, source: Source, left_out: LeftOut, options: Options) -> None:
+        super().__init__(path, source, left_out, options)
+        self._source = source
+        self._streams = plan_streams(source, rectify=options.rectify, compress=options.compress)
+        self.names = tuple(stream.topic for stream in self._streams)
+        self._poses: deque[tuple[int, FloatArray]] = deque()
+        if self.truth is not None:
+            rows = zip(self.truth.stamps_ns.tolist(), self.truth.T_world_frame, strict=True)
+            self._poses.extend(rows)
+        self.n_poses = len(self._poses)
+        self._bag = BagWriter(path, keeps_order=True)
+
+    def __enter__(self) -> BagTarget:
+        self._bag.__enter__()
+        self.path = self._bag.result
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Complete the bag."""
+        self._bag.__exit__(*exception)
+
+    def select(self, images: Iterator[StampedImage]) -> Iterator[StampedImage]:
+        """Yield all images, each after the true poses up to its stamp."""
+        is_first = True
+        for image in images:
+            if is_first:
+                self._write_static(image.stamp_ns)
+                is_first = False
+            self._write_poses(image.stamp_ns)
+            yield image
+
+    def _write_static(self, stamp_ns: int) -> None:
+        # Whoever plays the bag knows the cameras before the first image or pose comes.
+        stamp_ns = min([stamp_ns, *(first_ns for first_ns, _ in list(self._poses)[:1])])
+        first, second = self._streams
+        poses = static_poses(self._source, (first.frame_id, second.frame_id), stamp_ns)
+        bag_messages.write_transforms(self._bag, "/tf_static", poses, is_latched=True)
+
+    def _write_poses(self, until_ns: float = np.inf) -> None:
+        while self._poses and self._poses[0][0] <= until_ns:
+            pose = FramePose(self._poses[0][0], *TRUTH_FRAMES, self._poses[0][1])
+            bag_messages.write_transforms(self._bag, "/tf", [pose])
+            self._poses.popleft()
+
+    def write(self, image: StampedImage, pixels: NDArray[Any]) -> None:
+        """Write an image beside its calibration."""
+        stream = self._streams[image.stream]
+        header = Header(image.stamp_ns, stream.frame_id)
+        bag_messages.write_camera_info(self._bag, stream.info_topic, stream.calibration, header)
+        if not stream.is_compressed:
+            bag_messages.write_image(self._bag, stream.topic, pixels, header)
+        elif pixels.dtype == np.float32:
+            topic = f"{stream.topic}/compressedDepth"
+            bag_messages.write_compressed_depth(self._bag, topic, pixels, header)
+        else:
+            topic = f"{stream.topic}/compressed"
+            bag_messages.write_compressed(self._bag, topic, pixels, header)
+
+    def finish(self) -> None:
+        """Write the true poses after the last image."""
+        self._write_poses()
+
+
+def plan_streams(source: Source, *, rectify: bool, compress: bool) -> BagStreams:
+    """Decide where the streams of a recording go.
+
+    Parameters
+    ----------
+    source : Source
+        The recording; of depth the first image is read where it is to be compressed.
+    rectify : bool
+        Write raw images rectified and grey.
+    compress : bool
+        Write images as PNG; depth only where it is in whole millimetres.
+    """
+    info = source.info
+    calibrations, _ = plan_images(info, rectify=rectify)
+    is_rectified, is_compressed = calibrations[0].is_rectified, (compress, compress)
+    if info.sensor == "rgbd":
+        name = "image_rect_color" if is_rectified else "image_color"
+        topics = (f"/camera/rgb/{name}", "/camera/depth/image")
+        calibrations *= 2
+        is_compressed = (compress, compress and _is_in_millimetres(source))
+    else:
+        name = "image_rect" if is_rectified else "image_raw"
+        topics = (f"/stereo/left/{name}", f"/stereo/right/{name}")
+    first, second = map(BagStream, topics, _frame_ids(info), calibrations, is_compressed)
+    return first, second
+
+
+def _frame_ids(info: RecordingInfo) -> tuple[str, str]:
+    if info.sensor == "rgbd":
+        return (info.frame_id or "camera_color_optical_frame",) * 2
+    left, right = info.frame_id or "camera_left_optical", "camera_right_optical"
+    return left, right if left != right else f"{left}_right"
+
+
+def _is_in_millimetres(source: Source) -> bool:
+    """Tell whether the first depth image that can be read is of whole millimetres."""
+    for image in readable_images(source, LeftOut()):
+        if image.stream == 1:
+            try:
+                return exact_counts(image.load(), MILLIMETRES) is not None
+            except RecordingError:
+                continue
+    return False
+
+
+def static_poses(source: Source, frame_ids: tuple[str, str], stamp_ns: int) -> Iterator[FramePose]:
+    """Yield T_body_cam where the recording knows it, and T_left_right of a stereo pair.
+
+    Parameters
+    ----------
+    source : Source
+        The recording.
+    frame_ids : tuple of two str
+        Of both streams: the optical frames of the rectified cameras.
+    stamp_ns : int
+        Nanoseconds.
+    """
+    first, second = frame_ids
+    T_body_cam = pose_on_body(source)
+    if T_body_cam is not None and first != BODY_FRAME:
+        yield FramePose(stamp_ns, BODY_FRAME, first, T_body_cam)
+    if source.info.sensor == "stereo":
+        yield FramePose(stamp_ns, first, second, pose_of_right(source.info))

@@ -1,0 +1,130 @@
+"""What a summary says in plain words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from gvo.io.run_folder.writer import GLOBAL
+
+# A camera that keeps within a box of this diagonal is at rest, metres.
+_REST_M = 0.05
+# Sigmas that are right within this factor fit.
+_FIT_FACTOR = 2.0
+# What was learnt of a camera is told from here on, and where it is more than three sigmas.
+_OFFSET_PX = 0.1
+_READOUT_MS = 5.0
+
+
+def verdict(summary: Mapping[str, Any]) -> str:
+    """Say in plain words how far a run came, how good it is, and what is worth a look.
+
+    Parameters
+    ----------
+    summary : mapping
+        As `summary.json` holds it, also of a run that has not ended.
+    """
+    parts = [_how_far(summary), _how_good(summary), _how_sure(summary)]
+    looks = [*_looks_at_frames(summary), *_looks_at_camera(summary.get("rig_offsets") or {})]
+    text = "; ".join(part for part in parts if part)
+    return f"{text}. Worth a look: {'; '.join(looks)}." if looks else f"{text}."
+
+
+def _how_far(summary: Mapping[str, Any]) -> str:
+    n, n_tracked = summary.get("frames", 0), summary.get("tracked", 0)
+    path_m, extent_m = summary.get("path_m"), summary.get("extent_m")
+    way = f"{n} frames"
+    if path_m is not None:
+        way = f"{path_m:.2g} m in {n} frames" if path_m < 10.0 else f"{path_m:.0f} m in {n} frames"
+    if extent_m is not None and extent_m < _REST_M and n_tracked > 1:
+        way = f"at rest, within {extent_m:.2g} m, in {n} frames"
+    if summary.get("state", "complete") != "complete":
+        way = f"{way} so far"
+    counts = summary.get("status_counts", {})
+    words = {"coasting": "bridged", "lost": "lost", "skipped": "faulty"}
+    others = [f"{counts[key]} {word}" for key, word in words.items() if counts.get(key)]
+    tracked = "all tracked" if n_tracked == n > 0 else f"{n_tracked or 'none'} tracked"
+    return ", ".join([way, tracked, *others, *_segment_words(summary.get("segments", ()))])
+
+
+def _segment_words(segments: Sequence[Mapping[str, Any]]) -> list[str]:
+    if len(segments) < 2:
+        return []
+    n_joined = sum(segment.get("joined_to") is not None for segment in segments)
+    return [f"in {len(segments)} segments, {n_joined} of them joined to another"]
+
+
+def _how_good(summary: Mapping[str, Any]) -> str:
+    errors = {row["name"]: row for row in summary.get("errors", ())}
+    loops = (summary.get(GLOBAL) or {}).get("loops") or {}
+    is_closed = GLOBAL in errors and loops.get("counted", 0) > 0
+    best = errors.get(GLOBAL if is_closed else "smoothed")
+    if best is not None:
+        n, n_true = summary["frames"], best["n"]
+        where = "" if n_true >= 0.9 * n else f", known of {n_true} frames"
+        how = " with loops closed" if is_closed else ""
+        return f"{best['ate_m']:.2g} m from the truth{how}{where}"
+    if any(str(each).startswith("not compared") for each in summary.get("warnings", ())):
+        return "not compared with the truth"
+    is_over = summary.get("state", "complete") == "complete"
+    return "no truth to compare with" if is_over else ""
+
+
+def loop_words(summary: Mapping[str, Any]) -> str:
+    """Say how many loops were closed, and why others were not; empty without global poses.
+
+    Parameters
+    ----------
+    summary : mapping
+        As `summary.json` holds it.
+    """
+    loops = (summary.get(GLOBAL) or {}).get("loops")
+    if loops is None:
+        return ""
+    n, refused = loops["counted"], loops["refused"]
+    words = f"{n or 'no'} loop{'s' if n > 1 else ''} {'closed' if loops['found'] else 'found'}"
+    if refused:
+        reasons = ", ".join(f"{count}: {reason}" for reason, count in refused.items())
+        words += f", {sum(refused.values())} refused ({reasons})"
+    return words if n else f"{words}; global is the batch optimum of the same edges"
+
+
+def _how_sure(summary: Mapping[str, Any]) -> str:
+    rows = summary.get("covariances")
+    if not rows:
+        return ""
+    row = rows[0]
+    factor, span = row["nees"] ** 0.5, row["motion"].partition(" ")[2]
+    if factor < 1.0 / _FIT_FACTOR and row["nees"] < row["nees_low"]:
+        return f"covariances too large, {1.0 / factor:.2g} times in sigma"
+    if factor <= _FIT_FACTOR or row["nees"] <= row["nees_high"]:
+        return "covariances fit"
+    # Noise of the true poses is as large from frame to frame; errors of a motion add up.
+    jump_m = summary.get("truth_jump_m") or 0.0
+    if jump_m > 0.5 * row["error_m"]:
+        return f"covariances cannot be judged, the truth jumps by {jump_m:.2g} m between frames"
+    return (
+        f"covariances too small, {factor:.2g} times in sigma, unless the truth itself is off by "
+        f"{row['error_m']:.2g} m and {row['error_deg']:.2g} deg {span}"
+    )
+
+
+def _looks_at_frames(summary: Mapping[str, Any]) -> list[str]:
+    counts = summary.get("status_counts", {})
+    is_bad = any(counts.get(key) for key in ("coasting", "lost", "skipped"))
+    return ["frames.csv, which says why frames are not tracked"] if is_bad else []
+
+
+def _looks_at_camera(offsets: Mapping[str, Any]) -> list[str]:
+    found = []
+    disparity, row = offsets.get("disparity_px") or 0.0, offsets.get("row_px") or 0.0
+    sigma, readout = offsets.get("disparity_sigma_px") or 0.0, offsets.get("readout_ms") or 0.0
+    if abs(disparity) > max(_OFFSET_PX, 3.0 * sigma):
+        size = "large" if disparity > 0.0 else "small"
+        found.append(f"the calibration, disparities are {abs(disparity):.2g} px too {size}")
+    if abs(row) > 2.0 * _OFFSET_PX:
+        found.append(f"the rectification, rows of the right image are off by {abs(row):.2g} px")
+    sigma = offsets.get("readout_sigma_ms") or 0.0
+    if sigma and abs(readout) > max(_READOUT_MS, 3.0 * sigma):
+        found.append(f"a rolling shutter, rows are read out over {readout:.2g} ms")
+    return [f"{each} (learnt and corrected)" for each in found]
