@@ -404,7 +404,7 @@ def read_graph(source: EdgeSource, notes: SmoothingNotes) -> WholeGraph:
     """Read all poses and edges of an input; if it breaks off, note it."""
     graph = WholeGraph()
     if isinstance(source, PoseGraphSource):
-        graph.given.update(source.vertices)
+        graph.given.update(source.vertices.items())
     for event in _events(source, notes):
         if isinstance(event, PoseEvent):
             if isinstance(event.prior, PositionPrior):

@@ -162,7 +162,7 @@ def _id(text: str) -> int:
     try:
         return int(plain_number(text))
     except ValueError:
-        raise ValueError(f"the id {text!r} is no whole number") from None
+        raise ValueError(f"the id {text!r} is not a whole number") from None
 
 
 def transforms_of(numbers: FloatArray) -> FloatArray:

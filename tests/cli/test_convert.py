@@ -141,6 +141,7 @@ def test_settings_reach_the_pairs_of_kitti(command: Command, tmp_path: Path) -> 
     ("arguments", "expected"),
     [
         (["convert", "{kitti}", "a.zip"], r"a.zip: expected a name ending in .bag"),
+        (["convert", "{kitti}", "V1.01"], "got .01; give --layout"),
         (["convert", "{kitti}", "{kitti}"], "exists already"),
         (["convert", "{kitti}", "a", "--layout", "tum"], "cannot have the layout tum"),
         (["convert", "{kitti}", "a.bag", "--layout", "euroc"], "leave .bag away"),

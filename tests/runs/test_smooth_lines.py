@@ -56,7 +56,7 @@ def test_a_malformed_line_is_answered_and_the_stream_goes_on(tmp_path: Path) -> 
     assert not result.is_complete
     errors = {n: json.loads(a)["error"] for n, a in enumerate(answers) if "error" in json.loads(a)}
     assert set(errors) == {1, 3, 5, 6}
-    assert errors[1].startswith("line 2: no JSON")
+    assert errors[1].startswith("line 2: not JSON")
     assert "in the window with the stamp 100000000" in errors[3]
     assert "needs a stamp" in errors[6]
     assert result.summary["frames"] == 3

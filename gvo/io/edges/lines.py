@@ -109,7 +109,7 @@ def parse_csv(line: str) -> Request:
     try:
         fields = [field.strip() for field in next(csv.reader([line]), [])]
     except csv.Error as error:
-        raise ValueError(f"no line of CSV: {error}") from None
+        raise ValueError(f"not a line of CSV: {error}") from None
     if len(fields) < 2:
         raise ValueError(f"expected at least an id and a stamp, got {len(fields)} fields")
     if len(fields) == 2 and fields[0] in _ACTIONS:
@@ -154,7 +154,7 @@ def parse_json(line: str) -> Request:
     try:
         content = json.loads(line)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"no JSON: {error}") from None
+        raise ValueError(f"not JSON: {error}") from None
     return _request(_object(content, _KEYS, "a line"))
 
 
@@ -186,7 +186,7 @@ def _check_id(value: str | int, name: str) -> None:
     if isinstance(value, int) and abs(value) >= _STAMP_LIMIT_NS:
         raise ValueError(f"{name} {shortened(value)} has more than 63 bits")
     if isinstance(value, str) and (len(value) > _MAX_ID or not _is_writable(value)):
-        raise ValueError(f"{name} {shortened(value)} is no text of at most {_MAX_ID} characters")
+        raise ValueError(f"{name} {shortened(value)} is not a text of at most {_MAX_ID} characters")
 
 
 def _is_writable(text: str) -> bool:
@@ -198,7 +198,9 @@ def _csv_stamp(text: str) -> int | None:
     try:
         return int(plain_number(text)) if text else None
     except ValueError:
-        raise ValueError(f"the stamp {shortened(text)} is no whole number of nanoseconds") from None
+        raise ValueError(
+            f"the stamp {shortened(text)} is not a whole number of nanoseconds"
+        ) from None
 
 
 def _csv_numbers(fields: list[str]) -> list[float]:
@@ -210,7 +212,7 @@ def _csv_numbers(fields: list[str]) -> list[float]:
 
 def _stamp(value: object) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or abs(value) >= _STAMP_LIMIT_NS:
-        raise ValueError(f"the stamp {shortened(value)} is no whole number of nanoseconds")
+        raise ValueError(f"the stamp {shortened(value)} is not a whole number of nanoseconds")
     return value
 
 
@@ -291,10 +293,9 @@ def _covariance(content: Mapping[str, object], size: int) -> FloatArray | None:
 
 def _numbers(content: Mapping[str, object], name: str, n: int) -> FloatArray:
     values = content[name]
-    is_number = isinstance(values, list) and all(
-        isinstance(value, int | float) and not isinstance(value, bool) for value in values
-    )
-    if not is_number:
+    if not isinstance(values, list) or any(
+        isinstance(value, bool) or not isinstance(value, int | float) for value in values
+    ):
         raise ValueError(f"{name} must be a list of numbers")
     if len(values) != n:
         raise ValueError(f"{name} needs {n} numbers{_LAYOUTS.get(name, '')}, got {len(values)}")

@@ -57,7 +57,7 @@ class PoseGraphSource:
         self.name = path.stem
         self.faults = InputFaults()
         self.has_made_up_stamps = True
-        self.vertices: dict[FrameId, FloatArray] = {}
+        self.vertices: dict[int, FloatArray] = {}
         self.measurement_lines: list[str] = []
         self._edges: list[g2o.Measurement] = []
         self._fixed_ids: list[int] = []
@@ -132,7 +132,7 @@ class PoseGraphSource:
                 continue
             if not _TAG.match(tag):
                 raise TrajectoryError(
-                    f"{path}:{number}: {tag[:40]!r} is no tag of a g2o file; expected lines of "
+                    f"{path}:{number}: {tag[:40]!r} is not a tag of g2o; expected lines of "
                     f"{', '.join(g2o.TAGS)}"
                 )
             self.faults.add("lines are of tags that are not read", f"{tag} in line {number}")
@@ -164,7 +164,7 @@ def _texts(path: Path) -> Iterator[tuple[int, str]]:
 class _Connector:
     """Turns measurements into events: what is known, what waits."""
 
-    def __init__(self, fixed: dict[FrameId, FloatArray]) -> None:
+    def __init__(self, fixed: dict[int, FloatArray]) -> None:
         self._fixed = fixed
         self.known: set[int] = set()
         self._stamps_ns = count(0, _SECOND_NS)

@@ -214,7 +214,7 @@ class BaseFrame:
             return trajectory
         if not trajectory.has_rotations:
             raise TrajectoryError(
-                "positions of the camera without rotations tell no positions of "
+                "positions without rotations cannot be moved from the camera to "
                 f"{self.name or 'another frame'}; run without --frame to compare them"
             )
         if self.fixed_mount is not None:

@@ -64,7 +64,7 @@ def read_truth(source: Source, text: str, *, base_frame: BaseFrame | None = None
         return Truth(trajectory=trajectory, decision=_repeats(str(spec), trajectory) or str(spec))
     if not isinstance(source, BagSource):
         raise TrajectoryError(
-            f"{text}: names what is in a bag, and {source.info.name} is none; give a file"
+            f"{text}: names something in a bag, but {source.info.name} is not a bag; give a file"
         )
     truth = _in_bag(source, spec, base_frame or BaseFrame())
     if isinstance(truth, Failure):

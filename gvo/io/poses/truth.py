@@ -377,7 +377,7 @@ def _brought(
     if not np.any(is_known):
         child, asked = map(_named, ends)
         return Failure(
-            reason=f"it is of {child}, the estimate of {asked}: {reason}; "
+            reason=f"its poses are of {child}, those of the estimate of {asked}: {reason}; "
             f"give --frame {ends[0] or 'FRAME'} and its T_body_cam by --calibration FILE"
         )
     how = "" if ends[0] == ends[1] else f"; brought from {ends[0]} to {ends[1]} by tf"
@@ -397,8 +397,8 @@ def _at_point(found: Poses, points: FloatArray, ends: tuple[str, str], reason: s
     if len(points) == 0 or not np.allclose(points, points[0], atol=1e-6):
         reason = reason or f"tf moves {child} against {asked}"
         warning = (
-            f"where {child} lies from {asked} is not known ({reason}): the errors hold its lever "
-            "arm"
+            f"where {child} lies from {asked} is not known ({reason}): the errors include its "
+            "lever arm"
         )
         return Truth(trajectory=found.trajectory, decision=found.decision, warning=warning)
     place = ", ".join(f"{value:.3f}" for value in points[0])
@@ -459,8 +459,8 @@ class TruthComparison:
         estimated_m = max(map(_extent, self.estimates.values()))
         if estimated_m > _MIN_EXTENT_M and true_m < _MIN_SHARE * estimated_m:
             warnings.append(
-                f"it moves by {true_m:.2g} m where the estimate moves by {estimated_m:.2g} m: is "
-                "it of another frame, are PARENT and CHILD exchanged?"
+                f"it moves by {true_m:.2g} m, the estimate by {estimated_m:.2g} m: is it of "
+                "another frame, or are PARENT and CHILD exchanged?"
             )
         return warnings
 

@@ -145,7 +145,7 @@ def read_run(folder: str | Path) -> RunRecord:
     needed = ["frames.csv", "raw.txt", "smoothed.txt"]
     missing = [name for name in needed if not (folder / name).is_file()]
     if missing:
-        raise RecordingError(f"{folder}: is no run folder: no {missing[0]}; {_EXPECTED}")
+        raise RecordingError(f"{folder}: is not a run folder: {missing[0]} is missing; {_EXPECTED}")
     summary = _read_summary(folder / "summary.json")
     tables = {name: _read_table(folder / f"{name}.csv", _REQUIRED[name]) for name in _REQUIRED}
     trajectories = {name: _read_estimate(folder, name) for name in trajectory_names(folder)}

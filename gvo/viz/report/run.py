@@ -280,7 +280,7 @@ def _loops(loops: Table, first_ns: int) -> dict[str, Any] | None:
         *([f"{end_s:.1f}" for end_s in each] for each in ends),
         [str(count) for count in loops["n_inliers"]],
         [number_text(float(residual)) for residual in loops["residual"]],
-        loops["reason"],
+        loops["reason"].tolist(),
     )
     rows = [[column[index] for column in columns] for index in chosen]
     rest = f"; {n - len(chosen)} more are in loops.csv" if n > len(chosen) else ""

@@ -2,9 +2,6 @@
 
 from pathlib import Path
 
-import pytest
-
-from gvo.errors import RecordingError
 from gvo.io.bag.source import BagSource
 from gvo.io.convert.convert import convert
 from gvo.io.datasets.euroc import EurocSource
@@ -43,19 +40,3 @@ def test_the_layout_decides_where_it_is_given(tiny: Tiny, tmp_path: Path) -> Non
     convert(_pair(tiny), tmp_path / "a.bag")
     convert(open_recording(tmp_path / "a.bag"), tmp_path / "b", layout="bag")
     assert isinstance(open_recording(tmp_path / "b"), BagSource)
-
-
-def test_a_suffix_of_a_bag_makes_a_bag_of_a_bag(tiny: Tiny, tmp_path: Path) -> None:
-    convert(_pair(tiny), tmp_path / "a.bag")
-    convert(open_recording(tmp_path / "a.bag"), tmp_path / "b.mcap", compress=True)
-    assert isinstance(open_recording(tmp_path / "b.mcap"), BagSource)
-
-
-def test_contradictions_are_refused_with_a_way_out(tiny: Tiny, tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"--layout euroc makes a folder, .* leave \.bag away"):
-        convert(_pair(tiny), tmp_path / "a.bag", layout="euroc")
-    with pytest.raises(RecordingError, match="--png is for bags"):
-        convert(_pair(tiny), tmp_path / "a", layout="euroc", compress=True)
-    with pytest.raises(RecordingError, match=r"got \.01; give --layout"):
-        convert(_pair(tiny), tmp_path / "V1.01")
-    assert list(tmp_path.iterdir()) == []

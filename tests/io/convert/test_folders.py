@@ -23,7 +23,7 @@ from gvo.io.frames import frames
 from gvo.io.opening import RecordingOptions, open_recording
 from gvo.io.recording import DepthView, Source, StampedImage
 from gvo.trajectory.formats import read_trajectory, write_euroc, write_tum
-from gvo.trajectory.trajectory import Trajectory, format_stamp
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame, FloatArray, RgbdFrame
 from tests.io.conftest import Item, ListSource, Tiny
 
@@ -369,20 +369,6 @@ def test_many_images_that_are_left_out_are_counted_not_listed(tiny: Tiny, tmp_pa
     assert "no right image within sync.stereo_tolerance_ms" in written.skipped[0]
     assert written.skipped[-1] == "left image: 35 more images left out"
     assert sum(1 for _ in open_recording(tmp_path / "a").images()) == 6
-
-
-def test_the_tolerance_makes_pairs_of_kitti(tiny: Tiny, tmp_path: Path) -> None:
-    items: list[Item] = [
-        (stream, 10**9 * k + 2_000_000 * stream, tiny.texture(k))
-        for k in range(3)
-        for stream in (0, 1)
-    ]
-    config = Config.model_validate({"sync": {"stereo_tolerance_ms": 5}})
-    written = write_folder(tiny.stereo(items), tmp_path / "a", layout="kitti", config=config)
-    assert (written.n_images, written.skipped) == (6, ())
-    assert (tmp_path / "a" / "times.txt").read_text() == "".join(
-        f"{format_stamp(10**9 * k)}\n" for k in range(3)
-    )
 
 
 @pytest.mark.parametrize("layout", ["euroc", "tum"])

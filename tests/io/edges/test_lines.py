@@ -117,7 +117,7 @@ def test_json_may_hold_several_edges_and_a_prior() -> None:
         ("a,5,b,1,2,3,0,0,0,1,5", "six sigmas|6 sigmas"),
         ("a,5,b,x,2,3,0,0,0,1", "could not convert"),
         ("[]", "at least an id"),
-        ("{", "no JSON"),
+        ("{", "not JSON"),
         ("{}", "id is missing"),
         ('{"id": true}', "text or a whole number"),
         ('{"id": 1, "stamp": 5}', "unknown key 'stamp'"),

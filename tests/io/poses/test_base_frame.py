@@ -265,7 +265,7 @@ def test_true_poses_of_the_camera_become_those_of_the_frame_in_its_world(is_movi
 def test_positions_alone_are_not_moved_to_another_frame() -> None:
     positions = Trajectory.of_positions(np.arange(3), np.zeros((3, 3)))
     assert BaseFrame().convert(positions) is positions
-    with pytest.raises(TrajectoryError, match="positions of base_link"):
+    with pytest.raises(TrajectoryError, match="from the camera to base_link"):
         BaseFrame("base_link", np.eye(4)).convert(positions)
 
 

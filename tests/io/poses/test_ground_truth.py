@@ -167,33 +167,6 @@ def test_the_recorded_chain_of_odometry_is_the_recorded_topic(gvo_data: Path) ->
     assert difference < 1e-9
 
 
-@pytest.mark.recorded
-def test_a_recorded_chain_of_two_moving_edges_is_read(gvo_data: Path) -> None:
-    path = gvo_data / "bags/good/nav2_turtlebot.mcap"
-    truth = read(path, TfTruth(parent="map", child="base_link"))
-    lower, upper = (np.array(recorded_stamps(path, child)) for child in ("base_link", "odom"))
-    stamps = np.union1d(lower, upper)
-    first, last = max(lower[0], upper[0]), min(lower[-1], upper[-1])
-    expected = stamps[(stamps >= first) & (stamps <= last)]
-    np.testing.assert_array_equal(truth.trajectory.stamps_ns, expected)
-    # the filter's own poses, which it turns into the upper edge
-    amcl = read(path, "/amcl_pose")
-    inner = truth.trajectory.interpolate(amcl.trajectory.stamps_ns)
-    known = np.isin(amcl.trajectory.stamps_ns, inner.stamps_ns)
-    apart = np.linalg.norm(inner.positions - amcl.trajectory.positions[known], axis=1)
-    assert np.median(apart) < 0.1
-
-
-def recorded_stamps(path: Path, child: str) -> list[int]:
-    transforms = [
-        transform
-        for message in BagReader(path).messages(["/tf"])
-        for transform in message.decode().transforms
-        if transform.child_frame_id == child
-    ]
-    return [t.header.stamp.sec * SECOND + t.header.stamp.nanosec for t in transforms]
-
-
 POSE = np.eye(4)
 
 
@@ -275,11 +248,6 @@ def test_the_truth_of_a_recorded_bag_of_poses_is_found(gvo_data: Path) -> None:
     truth = find(gvo_data / "bags/good/pose_streams.bag")
     assert isinstance(truth, Poses)
     assert truth.decision == "groundtruth (geometry_msgs/msg/PoseStamped), 12765 poses"
-
-
-@pytest.mark.recorded
-def test_a_recorded_robot_without_truth_has_none(gvo_data: Path) -> None:
-    assert not find(gvo_data / "bags/good/nav2_turtlebot.mcap")
 
 
 names = st.text("abcxyz_019", min_size=1, max_size=8)

@@ -192,15 +192,6 @@ def test_what_is_neither_is_refused_in_one_line(bag: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.recorded
-def test_a_recorded_chain_has_no_error_against_itself(gvo_data: Path) -> None:
-    path = gvo_data / "bags/good/nav2_turtlebot.mcap"
-    for text in (f"{path}#tf:odom:base_link", f"{path}#tf:map:base_link"):
-        found = evaluate(read_poses(text), read_poses(text), name="same")
-        assert measures(found) == pytest.approx([0.0] * 4, abs=1e-5)
-        assert (found.reference_share, found.path_ratio) == (1.0, 1.0)
-
-
-@pytest.mark.recorded
 def test_recorded_streams_of_other_rates_than_the_truth_are_compared(gvo_data: Path) -> None:
     """The truth comes each 60 ms, the estimate each 67 ms: hardly any stamps are equal."""
     path = gvo_data / "bags/good/pose_streams.bag"

@@ -114,7 +114,7 @@ def test_poses_of_a_frame_out_of_reach_are_not_compared(camera_frame: str, reaso
     truth = truth_of(trajectory(motion()), "vicon/drone")
     found = in_frame(truth, TfBuffer(), camera_frame=camera_frame)
     assert isinstance(found, Failure)
-    assert found.reason.startswith("it is of vicon/drone, the estimate of ")
+    assert found.reason.startswith("its poses are of vicon/drone, those of the estimate of ")
     assert reason in found.reason
 
 
@@ -156,7 +156,7 @@ def test_an_antenna_whose_place_is_not_known_is_compared_with_a_warning() -> Non
     for buffer, reason in ((TfBuffer(), "holds no frame"), (moving, "tf moves gps against cam")):
         found = framed(truth_of(positions, "gps"), buffer, camera_frame="cam")
         assert reason in found.warning
-        assert found.warning.endswith("the errors hold its lever arm")
+        assert found.warning.endswith("the errors include its lever arm")
         np.testing.assert_array_equal(found.T_base_point, np.eye(4))
 
 

@@ -160,5 +160,5 @@ def test_damaged_files_are_refused_in_one_line(
 
 def test_what_is_no_run_folder_is_refused(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(RecordingError, match="is no run folder"):
+        with pytest.raises(RecordingError, match="is not a run folder"):
             read_run(path)
