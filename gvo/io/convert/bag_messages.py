@@ -74,25 +74,11 @@ class MessageWriter(ABC):
         self._store = typestore(is_ros1=is_ros1)
 
     def make(self, type_: str, **fields: Any) -> Any:  # noqa: ANN401 - made at run time
-        """Return a message.
-
-        Parameters
-        ----------
-        type_ : str
-            `package/msg/Name`.
-        **fields
-            All its fields, by name.
-        """
+        """Return a message of a type `package/msg/Name`, with all its fields by name."""
         return self._store.types[type_](**fields)
 
     def header(self, header: Header) -> Any:  # noqa: ANN401 - made at run time
-        """Return the message of a header.
-
-        Raises
-        ------
-        RecordingError
-            When the stamp does not fit into the message.
-        """
+        """Return the message of a header; refuse a stamp that does not fit into it."""
         sec, nanosec = divmod(header.stamp_ns, 10**9)
         max_seconds = _MAX_SECONDS_ROS1 if self.is_ros1 else _MAX_SECONDS_ROS2
         if not 0 <= sec <= max_seconds:

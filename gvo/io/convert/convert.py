@@ -132,13 +132,7 @@ def convert(
 
 
 def check_new(path: Path) -> None:
-    """Refuse a target that exists, or whose folder does not.
-
-    Raises
-    ------
-    RecordingError
-        With what to do.
-    """
+    """Refuse a target that exists, or whose folder does not."""
     if path.exists():
         raise RecordingError(f"{path}: exists already; give another path or remove it")
     if not path.parent.is_dir():

@@ -80,19 +80,7 @@ def is_header(line: str) -> bool:
 
 
 def parse_line(line: str, line_format: LineFormat) -> Request:
-    """Return what a line asks for.
-
-    Parameters
-    ----------
-    line : str
-        Not empty.
-    line_format : {"csv", "json"}
-
-    Raises
-    ------
-    ValueError
-        Saying what is wrong with the line.
-    """
+    """Return what a line, not empty, asks for; a ValueError says what is wrong with it."""
     if len(line) > MAX_LINE:
         raise ValueError(f"the line has more than {MAX_LINE} characters")
     return parse_json(line) if line_format == "json" else parse_csv(line)

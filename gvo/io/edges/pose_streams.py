@@ -45,19 +45,7 @@ class PoseSample:
 
 
 class PoseStream(Protocol):
-    """Poses of one frame over time, in a world of its own.
-
-    Attributes
-    ----------
-    name : str
-        Of the file or topic.
-    decisions : list of str
-        What was decided in reading it.
-    n_poses : int
-        How many may come.
-    stamps_from : {"file", "times", "rows", "topic"}
-        As of `Trajectory`.
-    """
+    """Poses of one frame over time, in a world of its own; `stamps_from` as of `Trajectory`."""
 
     name: str
     decisions: list[str]
@@ -114,19 +102,7 @@ class StepSigma:
 
 
 class TrajectoryStream:
-    """The poses of a TUM, KITTI or EuRoC file.
-
-    They have the covariances of the file beside it, see `read_trajectory`.
-
-    Parameters
-    ----------
-    path : Path
-
-    Raises
-    ------
-    TrajectoryError
-        Where it is missing, empty or malformed.
-    """
+    """The poses of a TUM, KITTI or EuRoC file, with the covariances of the file beside it."""
 
     def __init__(self, path: Path) -> None:
         self._trajectory = read_trajectory(path)

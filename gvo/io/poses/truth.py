@@ -125,27 +125,7 @@ class Poses:
 def read_poses(
     reader: MessageReader, spec: BagTruthSpec, *, where: str, buffer: TfBuffer | None = None
 ) -> Poses:
-    """Read poses out of a bag.
-
-    Parameters
-    ----------
-    reader : MessageReader
-    spec : TfTruth or str
-    where : str
-        The bag, for messages.
-    buffer : TfBuffer, optional
-        Of the bag; read from it where omitted and needed.
-
-    Returns
-    -------
-    Poses
-        Of a chain of tf a pose at each stamp of one of its moving edges.
-
-    Raises
-    ------
-    RecordingError
-        When the bag cannot be read, or holds no such poses.
-    """
+    """Read poses out of a bag; of a chain of tf a pose at each stamp of one of its moving edges."""
     if isinstance(spec, TfTruth):
         buffer = read_tf(reader, frames=spec) if buffer is None else buffer
         return _of_chain(buffer, spec, where)
@@ -434,13 +414,7 @@ class TruthComparison:
 
     @classmethod
     def of(cls, truth: Truth, estimates: Mapping[str, Trajectory]) -> TruthComparison:
-        """Compare estimates of the base frame.
-
-        Raises
-        ------
-        TrajectoryError
-            Where nothing can be associated.
-        """
+        """Compare estimates of the base frame."""
         comparable = {name: truth.comparable(estimate) for name, estimate in estimates.items()}
         evaluations = tuple(
             evaluate(truth.trajectory, estimate, name=name) for name, estimate in comparable.items()

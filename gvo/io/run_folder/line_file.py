@@ -13,13 +13,7 @@ from gvo.errors import OutputError, RecordingError, write_faults
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse a folder that cannot be made or written, before any work; nothing is made.
-
-    Raises
-    ------
-    OutputError
-        With the reason.
-    """
+    """Refuse a folder that cannot be made or written, before any work; nothing is made."""
     with write_faults(OutputError, folder):
         place = next(path for path in (folder, *folder.absolute().parents) if path.exists())
         is_folder = place.is_dir()
@@ -30,19 +24,7 @@ def check_folder(folder: Path) -> None:
 
 
 def check_new(path: Path, *, otherwise: str = "remove it") -> None:
-    """Refuse a path that holds something, or whose folder cannot be written, before any work.
-
-    Parameters
-    ----------
-    path : Path
-    otherwise : str
-        What to do where no other path will do.
-
-    Raises
-    ------
-    RecordingError
-        With what to do.
-    """
+    """Refuse a path that holds something, or whose folder cannot be written, with what to do."""
     check_folder(path.parent)
     is_empty = path.is_dir() and not any(path.iterdir())
     if os.path.lexists(path) and not is_empty:
@@ -50,13 +32,7 @@ def check_new(path: Path, *, otherwise: str = "remove it") -> None:
 
 
 def append_whole(file: io.FileIO, data: bytes) -> None:
-    """Append all of the data to an unbuffered file, or nothing.
-
-    Raises
-    ------
-    OSError
-        When it cannot be written, as on a full disk; the file is as long as before.
-    """
+    """Append all of the data to an unbuffered file; where it cannot be written, none of it."""
     length = file.seek(0, os.SEEK_END)
     rest = memoryview(data)
     try:
@@ -68,19 +44,7 @@ def append_whole(file: io.FileIO, data: bytes) -> None:
 
 
 class LineFile:
-    """A text file that grows by whole lines; replaces an existing one.
-
-    Parameters
-    ----------
-    path : Path
-    header : str
-        Its first line, with the line feed, or nothing.
-
-    Raises
-    ------
-    OSError
-        When it cannot be written.
-    """
+    """A text file that grows by whole lines after its header; replaces an existing one."""
 
     def __init__(self, path: Path, header: str) -> None:
         self.path = path
@@ -89,13 +53,7 @@ class LineFile:
         append_whole(self._file, header.encode())
 
     def write(self, lines: str) -> None:
-        """Append lines.
-
-        Raises
-        ------
-        OSError
-            When they cannot be written; none of them is.
-        """
+        """Append lines; where they cannot be written, none of them."""
         append_whole(self._file, lines.encode())
 
     def close(self) -> None:
@@ -104,13 +62,7 @@ class LineFile:
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Replace a text file atomically.
-
-    Raises
-    ------
-    OSError
-        When it cannot be written; the one before stands.
-    """
+    """Replace a text file atomically."""
     replace_bytes(path, text.encode())
 
 

@@ -17,13 +17,7 @@ _READOUT_MS = 5.0
 
 
 def verdict(summary: Mapping[str, Any]) -> str:
-    """Say in plain words how far a run came, how good it is, and what is worth a look.
-
-    Parameters
-    ----------
-    summary : mapping
-        As `summary.json` holds it, also of a run that has not ended.
-    """
+    """Say how far a run came, how good it is, and what is worth a look, from its `summary.json`."""
     parts = [_how_far(summary), _how_good(summary), _how_sure(summary)]
     looks = [*_looks_at_frames(summary), *_looks_at_camera(summary.get("rig_offsets") or {})]
     text = "; ".join(part for part in parts if part)
@@ -71,13 +65,7 @@ def _how_good(summary: Mapping[str, Any]) -> str:
 
 
 def loop_words(summary: Mapping[str, Any]) -> str:
-    """Say how many loops were closed, and why others were not; empty without global poses.
-
-    Parameters
-    ----------
-    summary : mapping
-        As `summary.json` holds it.
-    """
+    """Say how many loops were closed, and why others were not; empty without global poses."""
     loops = (summary.get(GLOBAL) or {}).get("loops")
     if loops is None:
         return ""
