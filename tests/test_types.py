@@ -78,3 +78,10 @@ def test_edges_and_estimates_keep_copies_that_nobody_can_write_to() -> None:
 
 def test_observations_count_their_points() -> None:
     assert len(observations_of(0, np.zeros((4, 3)), n_keypoints=9)) == 4
+
+
+def test_an_estimate_shows_its_position_along_the_axes_of_the_world() -> None:
+    pose = np.array([[0.0, 0, 1, 1], [0, 1, 0, 2], [-1, 0, 0, 3], [0, 0, 0, 1]])  # looks along x
+    covariance = np.diag(np.square([0.01, 0.02, 0.03, 0.1, 0.1, 0.5]))
+    shown = repr(Estimate(stamp_ns=5, T_world_frame=pose, covariance=covariance))
+    assert shown == "Estimate(0.000000005 s, (1.000 ± 0.5, 2.000 ± 0.1, 3.000 ± 0.1) m, ok)"

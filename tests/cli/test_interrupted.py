@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import gtsam
 import pytest
 
 import gvo
+from gvo.cli.terminal import ended_by_a_signal
 from gvo.frontend.klt import KltFrontend
 from gvo.io.bag.reader import BagMessage
 from gvo.runs.smooth import Smoother
@@ -182,3 +184,18 @@ def test_a_signal_while_the_demo_runs_ends_in_one_line(
     answer = command("demo", "--out", tmp_path)
     assert answer.code == 143
     assert answer.err == f"gvo: interrupted; what is done is in {tmp_path}; {ANEW}\n"
+
+
+def test_a_second_signal_ends_a_live_run_and_says_where_its_poses_are(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stopped = threading.Event()
+
+    def send_two() -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        assert stopped.wait(60)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(SystemExit, match="130"), ended_by_a_signal(stopped.set, tmp_path):
+        send_two()
+    assert capsys.readouterr().err == f"gvo: interrupted; the poses so far are in {tmp_path}\n"

@@ -177,6 +177,7 @@ def test_compare_counts_repeated_rows_and_needs_3_poses(command: Command, tmp_pa
     [
         (["run", "missing.bag", "--out", "out"], ["missing.bag", "does not exist"]),
         (["run", ".", "--out", "out"], ["a recording is"]),
+        (["run", "{bag}", ".", "--out", "out"], ["only bags can be combined into one recording"]),
         (["run", "text.bag", "--out", "out"], ["text.bag"]),
         (["run", "{bag}", "--out", "out", "--set", "window.n_link=3"], ["window.n_links"]),
         (["run", "{bag}", "--out", "out", "--set", "window.n_links=0"], ["window.n_links"]),

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import gvo
 from gvo.config import Config
@@ -21,7 +22,7 @@ from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import StampedImage
 from gvo.live.odometry import LiveOdometry, LiveRun, Stretches
 from gvo.live.topics import NetworkReader, TopicSource, wait_for
-from gvo.live.transport import SET_POSE, Parameters, decode
+from gvo.live.transport import Parameters, decode
 from gvo.runs.outputs.bag import TOPICS
 from gvo.trajectory.formats import read_trajectory
 from gvo.types import FloatArray
@@ -298,19 +299,23 @@ def test_a_pose_that_is_set_moves_the_world_and_not_odom(drive_bag: Path, tmp_pa
 
 
 def set_pose(play: Play, T: FloatArray, frame: str) -> None:
-    writer = play.live._writers[0]
-    from gvo.io.convert.bag_messages import Header, pose_numbers
-    from gvo.runs.outputs.bag_messages import _pose
+    types = typestore(is_ros1=False).types
 
-    SET_POSE.register(is_ros1=play.network.is_ros1)
-    stamped = writer.make(
+    def made(name: str, **fields: Any) -> Any:
+        return types[name](**fields)
+
+    x, y, z = T[:3, 3].tolist()
+    qx, qy, qz, qw = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
+    stamp = made("builtin_interfaces/msg/Time", sec=0, nanosec=0)
+    pose = made(
+        "geometry_msgs/msg/Pose",
+        position=made("geometry_msgs/msg/Point", x=x, y=y, z=z),
+        orientation=made("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+    )
+    stamped = made(
         "geometry_msgs/msg/PoseWithCovarianceStamped",
-        header=writer.header(Header(0, frame)),
-        pose=writer.make(
-            "geometry_msgs/msg/PoseWithCovariance",
-            pose=_pose(writer, pose_numbers(T).tolist()),
-            covariance=np.zeros(36),
-        ),
+        header=made("std_msgs/msg/Header", stamp=stamp, frame_id=frame),
+        pose=made("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
     )
     play.call("/gvo/set_pose", pose=stamped)
 
