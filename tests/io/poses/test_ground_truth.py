@@ -114,13 +114,6 @@ def between(stamps: list[int], poses: list[FloatArray], wanted: list[int]) -> Fl
     return se3.make_transform(R, t)
 
 
-def test_a_chain_may_be_followed_from_the_child_to_the_parent(tmp_path: Path) -> None:
-    path = chain_bag(tmp_path / "a.bag").write()
-    up = read(path, TfTruth(parent="base", child="map")).trajectory
-    down = read(path, TfTruth(parent="map", child="base")).trajectory
-    np.testing.assert_allclose(up.T_world_frame @ down.T_world_frame, [np.eye(4)] * 13, atol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("parent", "child", "reason"),
     [

@@ -352,3 +352,24 @@ def test_a_long_tf_is_kept_in_part(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert len(buffer) == 10 + 10 + 51
     assert "rim" in buffer.frames
     assert len(read_tf(reader)) == len(items)
+
+
+@pytest.mark.recorded
+def test_the_robot_of_nav2_stands_in_its_map_by_the_camera(gvo_data: Path) -> None:
+    reader = BagReader(gvo_data / "bags/good/nav2_turtlebot.mcap")
+    camera = "oakd_left_camera_optical_frame"
+    buffer = read_tf(reader, frames=["base_link", camera])
+    assert buffer.chain("base_link", camera) == (
+        "base_link",
+        "shell_link",
+        "oakd_camera_bracket",
+        "oakd_link",
+        "oakd_left_camera_frame",
+        camera,
+    )
+    assert len(buffer.edge_stamps_ns("base_link", camera)) == 0
+    T = buffer.lookup("base_link", camera, 0)
+    assert not isinstance(T, Failure)
+    # optical axes: z of the camera is forward, x of it the robot's right
+    np.testing.assert_allclose(T[:3, 2], [1.0, 0.0, 0.0], atol=1e-2)
+    np.testing.assert_allclose(T[:3, 0], [0.0, -1.0, 0.0], atol=1e-2)
