@@ -196,9 +196,7 @@ def check_(
 def smooth(
     inputs: Annotated[
         list[str],
-        Argument(
-            metavar="INPUT...", help="Pose graph (g2o), pose files or a bag; - reads JSON lines."
-        ),
+        Argument(metavar="INPUT...", help="Pose graph (g2o), pose files or a bag; - reads lines."),
     ],
     out: opt.Out = None,
     force: opt.Force = False,
