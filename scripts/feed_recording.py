@@ -64,4 +64,8 @@ def send(stream: str, stamp_ns: int, pixels: NDArray[Any]) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except gvo.GvoError as error:
+        print(f"feed_recording: error: {error}", file=sys.stderr)
+        sys.exit(2)

@@ -5,7 +5,7 @@ of ten pairs share a word or more; so a table of words names the places that a v
 a vocabulary that would have to be learnt. Of 720 places of rendered drives with 150 descriptors
 each it names the right one first for 98 % of the views, in 1.2 ms; a place is added in 0.3 ms.
 FLANN's LSH is as complete and as quick, but cannot be added to: to build it anew takes 160 ms.
-faiss's takes 3.2 ms, and a package of 65 MB (`scripts/benchmark_index.py`).
+faiss's takes 3.2 ms, and a package of 65 MB.
 
 References
 ----------

@@ -1,29 +1,34 @@
-"""Scripts that are refused what they are asked for."""
+"""Scripts, run in this process."""
 
 import runpy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from tests.conftest import Answer
+
 SCRIPTS = Path(__file__).parents[2] / "scripts"
-Script = Callable[[str, Sequence[object]], str]
+Script = Callable[..., Answer]
 
 
 @pytest.fixture
 def script(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> Script:
-    """Return a function that runs a script here, which must refuse, and gives its last line."""
+    """Return a function that runs a script by its name and arguments, in an empty folder."""
 
-    def refuse(name: str, arguments: Sequence[object]) -> str:
+    def run(name: str, *arguments: object) -> Answer:
         path = SCRIPTS / f"{name}.py"
         monkeypatch.setattr("sys.argv", [str(path), *map(str, arguments)])
-        with pytest.raises(SystemExit) as caught:
+        capfd.readouterr()
+        code = 0
+        try:
             runpy.run_path(str(path), run_name="__main__")
-        assert caught.value.code == 2
-        return capsys.readouterr().err.splitlines()[-1]
+        except SystemExit as ended:
+            code = int(ended.code or 0)
+        return Answer(code, *capfd.readouterr())
 
     monkeypatch.syspath_prepend(SCRIPTS)
     monkeypatch.chdir(tmp_path)
-    return refuse
+    return run

@@ -39,7 +39,7 @@ class Limits:
 
 
 # Recorded starts, then rendered ones of the worlds and sensors that they are named after. Their
-# errors are printed by scripts/benchmark.py, and in the message of a limit that is exceeded.
+# errors are printed by `benchmark.py errors`, and in the message of a limit that is exceeded.
 LIMITS = {
     KITTI: Limits(raw_ate_m=0.029, smoothed_ate_m=0.031, t_pct=0.78, path_error=0.002),
     EUROC: Limits(raw_ate_m=0.0046, smoothed_ate_m=0.0042),

@@ -1,4 +1,4 @@
-"""A window lives long, and so does a run: soaks, a part of their length."""
+"""A run holds no more memory when it goes on: the soak, a part of its length."""
 
 import gc
 import runpy
@@ -13,30 +13,10 @@ import gvo
 from gvo.frontend.klt import KltFrontend
 from gvo.io.synthetic.worlds.motion import LAP_M
 from gvo.types import Progress
-from tests.conftest import python
 
 pytestmark = pytest.mark.acceptance
 
-ROOT = Path(__file__).parents[2]
-BENCHMARK = ROOT / "scripts/benchmark.py"
-SOAK = ROOT / "tests/quality/soak.py"
-
-
-def test_a_short_life_ends_well() -> None:
-    n = 2000
-    # In a process of its own, as the memory of this one is that of other tests, too.
-    answer = python(BENCHMARK, "--soak", n, "--untimed")
-    # It fails by itself where a pose was not handed over exactly once, an estimate is not
-    # finite, or the memory of the last tenth is above that of the second.
-    assert answer.returncode == 0, answer.stderr
-    tenths = [line.split() for line in answer.stdout.splitlines()[1:11]]
-    assert [int(tenth) for tenth, _, _ in tenths] == list(range(1, 11))
-    assert f"n_poses={n}," in answer.stdout
-    # What a long life brings was there.
-    for count in ("n_gated", "n_rejected", "n_coasting", "n_priors"):
-        assert f"{count}=0" not in answer.stdout
-
-
+SOAK = Path(__file__).parents[1] / "quality/soak.py"
 N_LAP = 12
 # There and back once: the ends of the thirds see the same frame.
 N_THIRD = 2 * N_LAP - 2

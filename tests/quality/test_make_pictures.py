@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.acceptance.test_scripts import run
+from tests.acceptance.conftest import SCRIPTS
+from tests.conftest import python
 
 pytestmark = pytest.mark.acceptance
 
@@ -20,7 +21,7 @@ def pictures(drive_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with the pictures that take little time, of a short drive."""
     out = tmp_path_factory.mktemp("pictures") / "docs"
     options = ["--recording", drive_bag, "--frame", 5, "--only", "explain", "--only", "overlay"]
-    answer = run("make_pictures", "--out", out, *options)
+    answer = python(SCRIPTS / "make_pictures.py", "--out", out, *options)
     assert answer.returncode == 0, answer.stderr
     return out
 
@@ -42,7 +43,7 @@ def test_fewer_colours_keep_their_meaning(pictures: Path) -> None:
 
 def test_a_frame_beyond_the_end_is_told_with_no_traceback(drive_bag: Path, tmp_path: Path) -> None:
     options = ["--recording", drive_bag, "--frame", 20, "--only", "overlay"]
-    answer = run("make_pictures", "--out", tmp_path, *options)
+    answer = python(SCRIPTS / "make_pictures.py", "--out", tmp_path, *options)
     assert answer.returncode == 2
     assert "no usable frame from 20 on" in answer.stderr
     assert "Traceback" not in answer.stderr

@@ -1,6 +1,5 @@
 """Films of runs, decoded again."""
 
-import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,6 @@ from gvo.odometry.odometry import Odometry
 from gvo.runs.outputs.video import RunOverlay, film_width
 from gvo.types import FaultyFrame, Frame, FrameResult, ImageArray
 from gvo.viz.overlay import compose_faulty, compose_overlay
-from tests.conftest import python
 from tests.results import loop_of
 
 _N_FRAMES = 11
@@ -168,18 +166,3 @@ def test_what_cannot_be_written_is_told_to_the_run(drive: _Run, tmp_path: Path) 
 
     with pytest.raises(RecordingError, match="frames: cannot be written"):
         run()
-
-
-@pytest.mark.acceptance
-def test_the_overlay_benchmark_prints_a_table(drive_bag: Path, tmp_path: Path) -> None:
-    script = Path(__file__).parents[3] / "scripts" / "benchmark_overlay.py"
-    answer = python(script, drive_bag, "--rounds", 1, "--duration", 1)
-    assert answer.returncode == 0, answer.stderr
-    cells = re.split(r" *\| *", answer.stdout.splitlines()[-1].strip("| "))
-    assert cells[0] in ("drive.mcap", "drive")
-    assert all(float(cell) > 0.0 for cell in cells[3:7])
-    for wrong in ([tmp_path / "missing.bag"], ["x.bag", "--rounds", 0], ["x.bag", "--duration", 0]):
-        refused = python(script, *wrong)
-        assert refused.returncode == 2
-        assert "error" in refused.stderr
-        assert "Traceback" not in refused.stderr

@@ -1,4 +1,4 @@
-"""How late poses of a running camera are, which benchmark.py calls.
+"""Measure how late poses of a running camera are, and what is dropped where it is too fast.
 
 The frames of a recording come at true times, in a thread of their own as from a driver, first at
 10 Hz, then at the recorded rate; each waits until the one before has its pose, so that no queue is
@@ -9,8 +9,11 @@ what else the machine does. Somebody listens to every topic, so all clouds and p
 
 Then they come there and back at twice the rate of the frames alone: how old a frame is when it is
 taken and when its pose goes out, what becomes of each one, and memory.
+
+Example: python scripts/benchmark.py live kitti_06_start
 """
 
+import argparse
 import tempfile
 import threading
 import time
@@ -20,7 +23,6 @@ from itertools import cycle, islice
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
-import benchmark_passes as passes  # type: ignore[import-not-found]  # beside this one
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,6 +34,9 @@ from gvo.live.odometry import LiveOdometry
 from gvo.live.transport import Parameters, Service
 from gvo.runs.summary import peak_memory_mb
 from gvo.types import FaultyFrame, FloatArray, Progress
+
+from .cost import N_WARM_UP, in_child
+from .recordings import at_least
 
 N_MOST = 200  # frames of a recording
 N_TOO_MANY = 300  # that come too fast
@@ -55,18 +60,7 @@ class Instant(NamedTuple):
 
 
 class Feed:
-    """Pairs that come at a rate and are stamped by it, noting when.
-
-    Parameters
-    ----------
-    source : Source
-        Whose pairs they are.
-    pairs : sequence of Pair
-        Sent there and back again.
-    rate_hz : float
-    n_sent : int
-        How many; as many as there are where omitted.
-    """
+    """Pairs that come at a rate, there and back again, and are stamped by it; notes when."""
 
     def __init__(
         self,
@@ -146,7 +140,20 @@ class Listener:
         """Nothing is open."""
 
 
-def measure(path: Path, settings: Sequence[str], *, n_rounds: int) -> None:
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this sub-command."""
+    parser.add_argument("recordings", type=Path, nargs="+", help="bags or data-set folders")
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
+    parser.add_argument("--rounds", type=at_least(1), default=3, metavar="N")
+
+
+def measure(arguments: argparse.Namespace) -> None:
+    """Measure each recording in a process of its own."""
+    for path in arguments.recordings:
+        in_child(of_recording, path, arguments.set, n_rounds=arguments.rounds)
+
+
+def of_recording(path: Path, settings: Sequence[str], *, n_rounds: int) -> None:
     """Print latencies of a recording, and what is dropped of it."""
     config = gvo.load_configuration(settings=settings)
     source = gvo.open_recording(path, config=config)
@@ -186,7 +193,7 @@ def track_alone(feed: Feed, config: gvo.Config) -> Times:
         for frame in gvo.frames(feed, config, through=iter):
             odometry.track(frame)
             tracked[frame.stamp_ns] = Instant.now()
-    return feed.late_ms(tracked)[passes.N_WARM_UP :]
+    return feed.late_ms(tracked)[N_WARM_UP:]
 
 
 def track_live(feed: Feed, config: gvo.Config) -> Times:
@@ -197,7 +204,7 @@ def track_live(feed: Feed, config: gvo.Config) -> Times:
         live = LiveOdometry(feed, config, sinks=[listener])
         outputs = gvo.RunOutputs(report=False)
         live.run(folder, outputs=outputs, on_progress=lambda _: turn.release())
-    return feed.late_ms(listener.outlets[ODOMETRY].sent)[passes.N_WARM_UP :]
+    return feed.late_ms(listener.outlets[ODOMETRY].sent)[N_WARM_UP:]
 
 
 def overload(feed: Feed, config: gvo.Config) -> None:

@@ -5,15 +5,14 @@ relaxation as the start, and Levenberg-Marquardt until it converges. Tori and ga
 generated, with starts that are off by more than a radian. Then ten false loops are planted among
 ten true ones, and the positions compared with those without them.
 
-Example: python scripts/benchmark.py --graphs; python scripts/benchmark.py --graphs mine.g2o
+Example: python scripts/benchmark.py graphs mine.g2o
 """
 
+import argparse
 import tempfile
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
-import benchmark_tables as tables  # type: ignore[import-not-found]  # beside this one
 import gtsam
 import numpy as np
 
@@ -24,6 +23,8 @@ from gvo.io.edges.opening import open_edges
 from gvo.runs.smooth import SmoothingNotes, read_graph
 from gvo.trajectory.g2o import format_edge, format_vertex
 from gvo.types import FloatArray
+
+from .tables import Table
 
 EXAMPLES = ("sphere2500.txt", "pose3example-grid.txt", "pose3example.txt")
 SIGMAS = np.array([0.02] * 3 + [0.05] * 3)
@@ -39,22 +40,27 @@ HEADER = (
 )
 
 
-def measure(paths: Sequence[Path]) -> None:
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this sub-command."""
+    parser.add_argument("graphs", type=Path, nargs="*", help="g2o files, beside GTSAM's examples")
+
+
+def measure(arguments: argparse.Namespace) -> None:
     """Print a row for each graph, then what false loops do."""
+    examples = [Path(gtsam.findExampleDataFile(name)) for name in EXAMPLES]  # type: ignore[no-untyped-call]
     with tempfile.TemporaryDirectory() as folder:
-        examples = [Path(gtsam.findExampleDataFile(name)) for name in EXAMPLES]  # type: ignore[no-untyped-call]
-        rows = []
-        for path in [*paths, *examples, *generated(Path(folder))]:
-            rows.append(row(path))
-            print(", ".join(rows[-1]), flush=True)
-        print(f"\n{tables.markdown_table(HEADER, rows)}")
+        paths = [*arguments.graphs, *examples, *generated(Path(folder))]
+        table = Table(HEADER, [path.name for path in paths])
+        for path in paths:
+            table.add(row(path))
+    print()
     for seed in range(3):
         print(f"ten false loops among ten, seed {seed}: positions {false_loops(seed)}", flush=True)
 
 
 def row(path: Path) -> list[str]:
     """Return the cells of a graph: the medians of three turns."""
-    hand, own = zip(*[(by_hand(path), by_gvo(path)) for _ in range(3)], strict=True)
+    own, hand = zip(*[(by_gvo(path), by_hand(path)) for _ in range(3)], strict=True)
     errors = [turns[0][0] for turns in (hand, own)]
     times = [float(np.median([seconds for _, _, seconds in turns])) for turns in (hand, own)]
     return [

@@ -3,11 +3,12 @@
 A drive around a block, a tenth of its frames keyframes, which comes back to its start for the last
 fifth. Places are of the full size, with random descriptors in the real index; of a place that is
 seen again a tenth of the bits differ. Printed are CPU times, of all threads, and memory. What
-describing an image and registering it cost is left out: see `--loops`.
+describing an image and registering it cost is left out.
 
-Example: python scripts/benchmark.py --map 10000
+Example: python scripts/benchmark.py map --frames 10000
 """
 
+import argparse
 import time
 import tracemalloc
 from dataclasses import dataclass
@@ -21,6 +22,8 @@ from gvo.odometry.graph import RunGraph
 from gvo.odometry.loops import LoopDetector
 from gvo.types import Edge, Estimate, Failure, FloatArray
 
+from .recordings import at_least
+
 # As KLT keeps them by default, and more.
 N_POINTS = 160
 EVERY = 10
@@ -30,8 +33,14 @@ SIGMAS = np.array([0.0005] * 3 + [0.004] * 3)
 CAMERA = StereoCamera(fx=500, fy=500, cx=320, cy=120, width=640, height=240, baseline=0.5)
 
 
-def measure(n_frames: int) -> None:
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this sub-command."""
+    parser.add_argument("--frames", type=at_least(1000), default=10_000, metavar="N")
+
+
+def measure(arguments: argparse.Namespace) -> None:
     """Print the costs of a run of so many frames, then its memory."""
+    n_frames = arguments.frames
     stream = Stream(n_frames)
     stream.run()
     start = time.process_time()

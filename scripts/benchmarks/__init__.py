@@ -1,0 +1,1 @@
+"""The sub-commands of benchmark.py, a module each."""

@@ -1,0 +1,342 @@
+"""Each sub-command of the benchmark prints its tables, on small recordings; no time is judged."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import islice, takewhile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gvo
+from gvo.geometry import se3
+from gvo.io.recording import Source, StampedImage
+from gvo.testing.faults import Black, FaultyImage, FaultySource
+from gvo.types import FaultyFrame, Loop
+from scripts.benchmarks import cost, loops, recordings
+from tests import worlds
+from tests.acceptance.conftest import Script
+from tests.conftest import run_of
+
+pytestmark = pytest.mark.acceptance
+
+ROOT = Path(__file__).parents[2]
+N_FRAMES = 34  # just over a second, which the NEES needs
+SIGMAS = np.diag([0.01] * 3 + [0.1] * 3)  # rad, m
+
+
+Benchmark = Callable[..., str]
+
+
+@pytest.fixture
+def benchmark(script: Script) -> Benchmark:
+    """Return a function that runs a sub-command and gives what it prints."""
+
+    def run(*words: object) -> str:
+        answer = script("benchmark", *words)
+        assert answer.code == 0, answer.err
+        return answer.out
+
+    return run
+
+
+def table(text: str, first: str, number: int = 0) -> dict[str, list[str]]:
+    """Return the cells of a table, by those of its first column."""
+    lines = text.splitlines()
+    start = [n for n, line in enumerate(lines) if line.startswith(f"| {first} ")][number]
+    rows = takewhile(lambda line: line.startswith("|"), lines[start + 2 :])
+    cells = [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
+    return {name: numbers for name, *numbers in cells}
+
+
+def ates_m(source: Source, *settings: str, first: int = 0) -> list[float]:
+    """Return the errors of raw, causal and smoothed."""
+    config = gvo.load_configuration(settings=settings)
+    odometry = gvo.Odometry(source.info.camera, config)
+    results = []
+    for frame in islice(gvo.frames(source, config), first, None):
+        assert not isinstance(frame, FaultyFrame)
+        results.append(odometry.track(frame))
+    finished = [each for result in results for each in result.finished]
+    truth = source.ground_truth()
+    assert truth is not None
+    return [
+        gvo.evaluate(truth, gvo.Trajectory.of(estimates), name="").ate_m
+        for estimates in (
+            [result.raw for result in results],
+            [result.causal for result in results],
+            [*finished, *odometry.finish()],
+        )
+    ]
+
+
+def assert_close(cells: list[str], expected: Any) -> None:
+    np.testing.assert_allclose(np.array(cells, dtype=float), expected, atol=6e-5)
+
+
+def test_errors_of_recordings_are_those_of_a_run(
+    benchmark: Benchmark, drive_bag: Path, room_bag: Path
+) -> None:
+    printed = benchmark("errors", drive_bag, room_bag)
+    rows = table(printed, "recording")
+    assert [row[0] for row in rows.values()] == ["20", "20"]
+    for name, bag in zip(("drive", "room"), (drive_bag, room_bag), strict=True):
+        assert_close(rows[name][1:4], ates_m(gvo.open_recording(bag)))
+    assert [len(row) for row in table(printed, "recording", 1).values()] == [4, 4]
+
+
+def test_each_start_has_its_first_frame_and_its_seed(benchmark: Benchmark, room_bag: Path) -> None:
+    settings = ["frontend.kind=descriptor"]
+    rows = table(benchmark("errors", room_bag, "--starts", 2, "--set", *settings), "start")
+    source = gvo.open_recording(room_bag)
+    expected = np.array(
+        [ates_m(source, *settings, f"ransac.seed={100 + k}", first=k)[::2] for k in range(2)]
+    )
+    for name, ates in zip(
+        ("0", "1", "median", "worst"),
+        (*expected, np.median(expected, axis=0), expected.max(axis=0)),
+        strict=True,
+    ):
+        assert_close(rows[name][4:6], ates)
+
+
+def test_errors_of_seeds_are_printed_again_from_the_kept_bags(
+    benchmark: Benchmark, tmp_path: Path
+) -> None:
+    options = ["--frames", N_FRAMES, "--kind", "room", "--readout", 20]
+    options += ["--scale", 0.3, "--keep", tmp_path / "kept"]
+    printed = benchmark("errors", "--seeds", "3-4", *options)
+    rows = table(printed, "seed")
+    assert list(rows) == ["3", "4", "median", "worst"]
+    paths = sorted((tmp_path / "kept").iterdir())
+    kept = [gvo.open_recording(path) for path in paths]
+    for seed, recording in zip((3, 4), kept, strict=True):
+        rendered = gvo.SyntheticRecording(
+            "handheld", "rgbd", n_frames=N_FRAMES, seed=seed, scale=0.3, readout_ms=20.0
+        )
+        for one, other in zip(islice(rendered.images(), 4), recording.images(), strict=False):
+            np.testing.assert_array_equal(one.load(), other.load())
+    expected = np.array([ates_m(recording)[::2] for recording in kept])
+    for name, ates in zip(("3", "4"), expected, strict=True):
+        assert_close(rows[name][4:6], ates)
+    n_better = np.count_nonzero(expected[:, 1] <= expected[:, 0])
+    assert printed.endswith(f"smoothed ATE <= raw ATE on {n_better} of 2\n")
+    # The raw chain and the window hold poses a second apart, not ten.
+    assert ["-" in rows["3"][column] for column in (6, 7, 8, 9)] == [False, True, False, True]
+    written = {path: path.stat().st_mtime_ns for path in paths}
+    again = benchmark("errors", "--seeds", "3-3", *options)
+    assert table(again, "seed")["3"] == rows["3"]
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "kept").iterdir()} == written
+
+
+def test_the_kinds_show_all_worlds() -> None:
+    assert {kind.world for kind in recordings.KINDS.values()} == set(worlds.KINDS)
+
+
+def test_the_cost_of_a_run_is_told_beside_the_yardstick(
+    benchmark: Benchmark, drive_bag: Path
+) -> None:
+    printed = benchmark("cost", drive_bag, "--rounds", 1)
+    for stage in ("read", "extract", "register", "links", "window", "loops", "total"):
+        assert len(re.findall(rf"^{stage} +\d+\.\d\d +\d+\.\d\d$", printed, re.MULTILINE)) == 1
+    cpu, wall, rate, yardstick, cpu_ratio, wall_ratio, peak, growth = map(
+        float, table(printed, "recording")["drive"]
+    )
+    assert rate == pytest.approx(1000.0 / wall, rel=0.02)
+    assert cpu_ratio == pytest.approx(cpu / yardstick, rel=0.05)
+    assert wall_ratio == pytest.approx(wall / yardstick, rel=0.05)
+    assert peak > growth
+
+
+def checkout(folder: Path, main: str) -> Path:
+    """Write another version of gvo, all of whose commands do the same."""
+    (folder / "gvo").mkdir(parents=True)
+    (folder / "gvo" / "__init__.py").touch()
+    (folder / "gvo" / "cli.py").write_text(f"import sys\n\ndef main():\n    {main}\n")
+    return folder
+
+
+def test_whole_runs_of_two_versions_take_turns(
+    benchmark: Benchmark, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = tmp_path / "log"
+    note = f"open({str(log)!r}, 'a').write(' '.join(['{{}}', *sys.argv[1:-1]]) + '\\n')"
+    other = checkout(tmp_path / "other", note.format("other"))
+    own = checkout(tmp_path / "own", f"{note.format('own')}; text = 'x' * 10**8; text.count('y')")
+    monkeypatch.setattr("gvo.__file__", str(own / "gvo" / "__init__.py"))
+    options = ["--demo", "--rounds", 1, "--set", "klt.n_corners=9", "--against", other]
+    rows = table(benchmark("cost", "room.bag", *options), "command")
+    for row in (rows["room.bag"], rows["demo"]):
+        cpu, memory = (list(map(float, row[k : k + 3])) for k in (0, 6))
+        assert cpu[0] > cpu[1] > 0.0
+        assert memory[0] > memory[1] + 80.0
+        assert memory[2] == pytest.approx(memory[0] / memory[1], rel=0.1)
+    run = f"run {tmp_path / 'room.bag'} --set klt.n_corners=9 --out"
+    words = [
+        f"{who} {what}" for what in (run, "demo --out") for _ in "12" for who in ("own", "other")
+    ]
+    assert log.read_text().splitlines() == words
+    # Without another version the demo is measured alone.
+    assert len(table(benchmark("cost", "--demo", "--rounds", 1), "command")["demo"]) == 3
+
+
+def test_a_command_that_fails_is_told(tmp_path: Path) -> None:
+    with pytest.raises(gvo.GvoError, match="failed: no such day"):
+        cost.process_cost(["demo"], checkout(tmp_path, "sys.exit('no such day')"))
+
+
+def round_trip() -> gvo.Trajectory:
+    """Return two rounds of 20 s on a circle of 10 m, then half of one the other way round."""
+    turns = (
+        2.0 * np.pi * np.concatenate([np.arange(0.0, 2.0, 0.05), 2.0 - np.arange(0.0, 0.5, 0.05)])
+    )
+    T = se3.exp(np.outer(turns, [0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
+    T[:, :3, 3] = 10.0 * np.column_stack([np.cos(turns), np.sin(turns), 0.0 * turns])
+    T[40:] = T[40:] @ se3.exp(np.array([0.0, 0.0, np.pi, 0.0, 0.0, 0.0]))
+    stamps_ns = 1_000_000_000 * np.arange(len(T))
+    return gvo.Trajectory(stamps_ns=stamps_ns, T_world_frame=T)
+
+
+def test_a_visit_is_a_place_seen_before_from_the_same_side() -> None:
+    earlier, later = loops.visits(round_trip())
+    np.testing.assert_array_equal(later, np.arange(20, 40))
+    np.testing.assert_array_equal(earlier, np.arange(20))
+
+
+def test_the_error_of_a_visit_is_that_of_the_relative_pose() -> None:
+    truth = round_trip()
+    T = truth.T_world_frame.copy()
+    T[20:, 0, 3] += 0.3
+    n, *errors = loops.of_visits(truth, [replace(truth, T_world_frame=T), truth])
+    assert n == 20
+    np.testing.assert_allclose(errors, [0.3, 0.0, 0.0, 0.0, 0.0], atol=1e-6)
+
+
+def test_loops_are_counted_by_what_the_truth_says() -> None:
+    truth = round_trip()
+    # Three accepted, of which one is unlikely and one wrong, and two refused.
+    noises = np.zeros((5, 6))
+    noises[:, 5] = 0.1, 0.45, 0.0, 3.0, 0.2
+    noises[2, 1] = 0.1
+    found = [
+        Loop(
+            stamp_ns=(20 + k) * 10**9,
+            reference_ns=k * 10**9,
+            T_reference_frame=se3.invert(truth.T_world_frame[k])
+            @ truth.T_world_frame[20 + k]
+            @ se3.exp(noise),
+            covariance=SIGMAS**2 / (1.0 + k),
+            n_matches=50,
+            n_inliers=40,
+            reason="lonely" if k > 2 else "",
+        )
+        for k, noise in enumerate(noises)
+    ]
+    assert loops.of_loops(truth, found) == [5, 2, 3, 1, 2]
+    # A loop whose truth is not known is not judged.
+    assert loops.of_loops(truth.select(slice(1, None)), found) == [4, 2, 2, 1, 2]
+
+
+def test_the_light_goes_out_and_the_lens_breathes() -> None:
+    room = gvo.SyntheticRecording("handheld", n_frames=12, scale=0.1)
+    dark = loops.darkened(room, (0.1, 0.3))
+    left = [image.load().any() for image in dark.images() if image.stream == 0]
+    assert np.flatnonzero(~np.array(left)).tolist() == list(range(3, 9))
+    assert loops.drifting(room, 0.0) is room
+    *_, last = room.images()
+    *_, breathing = loops.drifting(room, 5.0).images()
+    assert (last.load() != breathing.load()).any()
+    # A quarter of a breath after the first image, what is magnified is off the middle by more.
+    image = np.zeros((101, 201), dtype=np.uint8)
+    image[50, 180] = 255
+    given = StampedImage(stream=0, stamp_ns=10_000_000_000, load=image.copy)
+    grown = loops.Breathing(amount=0.05).spoil(image, FaultyImage(given=given, frame=0))
+    assert np.argwhere(grown == grown.max()).tolist() == [[50, 184]]
+
+
+def test_global_poses_are_judged_as_the_runs_tell_them(
+    benchmark: Benchmark, tmp_path: Path
+) -> None:
+    options = ["--seeds", "2-2", "--kind", "room", "--frames", 40, "--dark", "0.5-0.8"]
+    cells = table(benchmark("loops", *options), "recording")["handheld-rgbd"]
+    room = gvo.SyntheticRecording("handheld", "rgbd", n_frames=40, seed=2, scale=0.5)
+    run_of(FaultySource(room, Black(first=15, end=24)), tmp_path / "dark")
+    run_of(room, tmp_path / "unbroken")
+    rows = (tmp_path / "dark/frames.csv").read_text().splitlines()[1:]
+    is_lit = np.array([row.split(",")[1] in ("ok", "resumed") for row in rows])
+    assert 28 <= is_lit.sum() <= 31
+    ates = [
+        gvo.evaluate(
+            room.ground_truth(), gvo.read_trajectory(tmp_path / name).select(is_lit), name=name
+        ).ate_m
+        for name in ("dark/smoothed.txt", "dark/global.txt", "unbroken/global.txt")
+    ]
+    assert_close([cells[0], cells[1], cells[13]], ates)
+    assert cells[3:5] == ["0", "-, -"]  # it is too short to come back
+    assert cells[6:13] == ["-", "0", "0", "0", "0", "0", "1"]
+
+
+def test_whole_graphs_are_optimized_beside_gtsam_by_hand(
+    benchmark: Benchmark, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("benchmarks.graphs.EXAMPLES", ("pose3example.txt",))
+    printed = benchmark("graphs")
+    rows = table(printed, "graph")
+    assert list(rows) == ["pose3example.txt", "torus.g2o", "garage.g2o"]
+    assert all(abs(float(row[3])) < 1e-6 for row in rows.values())
+    false_loops = re.findall(r"([\d.]+) m off without, ([\d.]+) m with them", printed)
+    assert len(false_loops) == 3
+    assert all(abs(float(a) - float(b)) < 1e-3 for a, b in false_loops)
+
+
+def test_the_map_of_a_long_run_is_measured(benchmark: Benchmark) -> None:
+    printed = benchmark("map", "--frames", 1000)
+    n_loops, error_m = re.findall(r"loops (\d+), errors ([\d.]+) m", printed)[0]
+    assert int(n_loops) > 5
+    assert float(error_m) < 0.5
+    assert "memory per keyframe: " in printed
+
+
+def test_frames_that_come_too_fast_are_accounted_for(benchmark: Benchmark, drive_bag: Path) -> None:
+    lines = benchmark("live", drive_bag, "--rounds", 1).splitlines()
+    assert any(line.startswith("ratio of the medians: ") for line in lines)
+    (n_sent,) = (int(line.split()[0]) for line in lines if "--max-lag" in line)
+    (counts,) = (line for line in lines if line.endswith(" faulty"))
+    assert sum(map(int, re.findall(r"\d+", counts))) == n_sent
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("", "the following arguments are required: COMMAND"),
+        ("errors", "expected recordings or --seeds"),
+        ("errors missing.bag", "missing.bag"),
+        ("errors --seeds 0", "argument --seeds"),
+        ("errors --seeds 1 --starts 0", "argument --starts"),
+        ("errors --seeds 1 --kind hand --readout 50", "readout_ms must be in"),
+        (f"errors --seeds 1 --keep {__file__}", "cannot be written"),
+        ("cost", "expected recordings or --demo"),
+        ("cost missing.bag", "missing.bag"),
+        ("cost missing.bag --against .", "expected a checkout"),
+        ("cost x.bag --rounds 0", "argument --rounds"),
+        ("loops", "expected recordings or --seeds"),
+        ("loops missing.bag --drift 1", "missing.bag"),
+        ("loops x.bag --drift 9", "argument --drift"),
+        ("loops x.bag --dark 3", "argument --dark"),
+        ("loops x.bag --set loops.enabled=false", "expected loops.enabled"),
+        ("loops --kind room --frames 9 --scale 0.1 --seeds 1 --dark 1-9", "--dark: expected a"),
+        ("graphs missing.g2o", "missing.g2o"),
+        ("map --frames 10", "argument --frames"),
+        ("live", "required: recordings"),
+        ("live missing.bag", "missing.bag"),
+    ],
+)
+def test_what_cannot_be_measured_is_told_in_one_line(
+    script: Script, words: str, message: str
+) -> None:
+    answer = script("benchmark", *words.split())
+    assert answer.code == 2
+    assert message in answer.err.splitlines()[-1]
+    assert "Traceback" not in answer.err
