@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -12,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo.config import Config
-from gvo.diagnostics.check.findings import Finding, unknown
+from gvo.diagnostics.check.findings import Finding
 from gvo.diagnostics.check.images import check_frozen
-from gvo.diagnostics.check.limits import MAX_DEPTH_MEDIAN_M, measured
+from gvo.diagnostics.check.limits import measured, unknown
 from gvo.diagnostics.check.sampling import Sample
 from gvo.frontend.rgbd import sample_depth
 from gvo.frontend.tracking import detect_corners
-from gvo.types import BoolArray, DepthArray, Failure, FloatArray, ImageArray, RgbdFrame
+from gvo.types import BoolArray, DepthArray, Failure, FloatArray, RgbdFrame
 
 _MAX_SHIFT_PX = 12
 # Pixels of depth lost along edges (negative: smeared over them), on both sides alike. If the first
@@ -34,22 +33,12 @@ _N_POINTS_PER_FRAME = 500
 _MIN_POINTS = 300
 # Minimum gain in strength of the colour edges at the best shift over the typical one.
 _MIN_CONTRAST = 0.25
-# Depths this close to the median, relative, give the quantization step there.
-_NEAR_MEDIAN = 0.1
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Misregistration:
-    """Offset of depth from colour.
+class Misregistration(NamedTuple):
+    """Offset (u, v) from depth to colour, pixels, NaN along an axis without evidence.
 
-    Parameters
-    ----------
-    shift_px : tuple of two float
-        (u, v) from depth to colour; NaN along an axis without evidence.
-    zoom : float
-        Size of colour over size of depth, about the middle of the image.
-    rms_px : float
-        RMS of the offset over the image.
+    `zoom` is the size of colour over that of depth, `rms_px` the offset over the whole image.
     """
 
     shift_px: tuple[float, float]
@@ -58,9 +47,9 @@ class Misregistration:
 
 
 class _Strips(NamedTuple):
-    """Strength of colour edges along one axis around steps of depth.
+    """Strength of colour edges along one axis around steps of depth, NaN outside the image.
 
-    `values` (n, 2 * reach + 1) are NaN outside the image; `offsets` (n,) are from its middle.
+    `values` have the shape (n, 2 * reach + 1); `offsets` (n,) are from the middle of the image.
     """
 
     values: NDArray[np.float32]
@@ -68,6 +57,7 @@ class _Strips(NamedTuple):
 
 
 _Axis = tuple[_Strips, _Strips]
+"""Around the steps from near to far, and around those from far to near."""
 
 
 def estimate_misregistration(frames: Sequence[RgbdFrame]) -> Misregistration | Failure:
@@ -89,20 +79,21 @@ def estimate_misregistration(frames: Sequence[RgbdFrame]) -> Misregistration | F
         ]
         for zoom in _ZOOMS
     }
-    contrasts = {zoom: _contrast(scores[zoom]) for zoom in _ZOOMS}
-    zoom = max(contrasts, key=lambda zoom: contrasts[zoom])
+    contrasts = {
+        zoom: float(np.mean([score.max() - 1.0 for score in found if score is not None]))
+        for zoom, found in scores.items()
+    }
+    zoom = max(_ZOOMS, key=contrasts.__getitem__)
     if contrasts[zoom] < _MIN_ZOOM_GAIN * contrasts[0.0]:
         zoom = 0.0
     if contrasts[zoom] < _MIN_CONTRAST:
         return Failure(reason="edges of depth and colour do not meet anywhere")
-    shift = [math.nan if score is None else _peak(score) for score in scores[zoom]]
-    if not np.any(np.isfinite(shift)):
+    u, v = (math.nan if score is None else _peak(score) for score in scores[zoom])
+    if math.isnan(u) and math.isnan(v):
         return Failure(reason="the two sides of things disagree about the offset")
     height, width = frames[0].depth.shape
-    variance = np.nansum(np.square(shift)) + zoom**2 * (width**2 + height**2) / 12.0
-    return Misregistration(
-        shift_px=(shift[0], shift[1]), zoom=1.0 + zoom, rms_px=math.sqrt(float(variance))
-    )
+    variance = np.nansum(np.square([u, v])) + zoom**2 * (width**2 + height**2) / 12.0
+    return Misregistration((u, v), 1.0 + zoom, math.sqrt(float(variance)))
 
 
 def depth_steps(depth: DepthArray) -> tuple[BoolArray, BoolArray]:
@@ -137,17 +128,16 @@ def _collect(frames: Sequence[RgbdFrame], axis: int) -> _Axis:
     parts: tuple[list[_Strips], list[_Strips]] = ([], [])
     for frame in frames:
         image, depth = (frame.image, frame.depth) if axis == 1 else (frame.image.T, frame.depth.T)
-        edges = _edge_strength(np.ascontiguousarray(image))
+        # The gradient along rows, clipped at its 90th percentile and scaled to one.
+        smooth = cv2.GaussianBlur(image.astype(np.float32, order="C"), (0, 0), 1.0)
+        sizes = np.abs(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3))
+        edges = np.minimum(sizes / (np.percentile(sizes, 90) + 1e-6), 1.0).astype(np.float32)
         for part, steps in zip(parts, depth_steps(np.ascontiguousarray(depth)), strict=True):
             part.append(_cut(edges, steps, rng))
-    return _joined(parts[0]), _joined(parts[1])
-
-
-def _edge_strength(image: ImageArray) -> NDArray[np.float32]:
-    """Return the gradient along rows, clipped at its 90th percentile and scaled to one."""
-    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.0)
-    sizes = np.abs(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3))
-    return np.asarray(np.minimum(sizes / (np.percentile(sizes, 90) + 1e-6), 1.0), dtype=np.float32)
+    before, after = (
+        _Strips(*(np.concatenate(each) for each in zip(*part, strict=True))) for part in parts
+    )
+    return before, after
 
 
 def _cut(edges: NDArray[np.float32], steps: BoolArray, rng: np.random.Generator) -> _Strips:
@@ -162,10 +152,6 @@ def _cut(edges: NDArray[np.float32], steps: BoolArray, rng: np.random.Generator)
     return _Strips(values, columns - 0.5 * (width - 1))
 
 
-def _joined(parts: Sequence[_Strips]) -> _Strips:
-    return _Strips(*map(np.concatenate, zip(*parts, strict=True)))
-
-
 def _score(pair: _Axis, zoom: float) -> FloatArray:
     """Return the edge strength over (loss, shift), relative to the typical one."""
     before, after = (_profile(strips, zoom) for strips in pair)
@@ -174,22 +160,19 @@ def _score(pair: _Axis, zoom: float) -> FloatArray:
 
 
 def _profile(strips: _Strips, zoom: float) -> FloatArray:
+    """Return the mean edge strength over shifts, relative to its median; 1 outside the image."""
     middle = strips.values.shape[1] // 2
     moved = middle + np.rint(zoom * strips.offsets).astype(np.int64)
     positions = moved[:, np.newaxis] + np.arange(-_REACH_PX, _REACH_PX + 1)
     values = np.take_along_axis(strips.values, positions, axis=1)
     is_seen = np.isfinite(values).any(axis=0)
     if not np.any(is_seen):
-        return np.ones(values.shape[1])  # all outside the image: no peak
+        return np.ones(values.shape[1])
     seen = np.nanmean(values[:, is_seen], axis=0).astype(np.float64)
-    means = np.full(values.shape[1], np.median(seen))  # outside the image: no peak
+    means = np.full(values.shape[1], np.median(seen))
     means[is_seen] = seen
     smooth = np.convolve(np.pad(means, 1, mode="edge"), [0.25, 0.5, 0.25], mode="valid")
     return np.asarray(smooth / max(float(np.median(smooth)), 1e-6))
-
-
-def _contrast(scores: Sequence[FloatArray | None]) -> float:
-    return float(np.mean([score.max() - 1.0 for score in scores if score is not None]))
 
 
 def _peak(score: FloatArray) -> float:
@@ -216,12 +199,8 @@ def check_depth(samples: Sequence[Sample], config: Config) -> Iterator[Finding]:
     if not frames:
         yield unknown("depth: median", "no depth image to look at")
         return
-    depths = [frame.depth for frame in frames]
-    yield _check_scale(depths)
-    yield _check_range(depths, config)
-    yield _check_holes(depths)
+    yield from _check_values([frame.depth for frame in frames], config)
     yield _check_corners(frames, config)
-    yield _check_levels(depths)
     pairs = [
         (sample.first.depth, sample.second.depth)
         for sample in samples
@@ -232,34 +211,25 @@ def check_depth(samples: Sequence[Sample], config: Config) -> Iterator[Finding]:
     yield _check_registration(frames)
 
 
-def _check_scale(depths: Sequence[DepthArray]) -> Finding:
-    medians = [float(np.nanmedian(depth)) for depth in depths]
-    median_m = float(np.median(medians))
-    direction = "higher" if median_m > MAX_DEPTH_MEDIAN_M else "lower"
-    return measured(
-        "scale",
-        median_m,
-        stream="depth",
-        text=f"median {median_m:.3g} m, of images {min(medians):.3g} .. {max(medians):.3g} m",
-        fix=f"set depth.scale (counts per metre: 1000 for mm, 5000 for TUM) {direction}",
-    )
-
-
-def _check_range(depths: Sequence[DepthArray], config: Config) -> Finding:
-    low, high = config.depth.min_depth_m, config.depth.max_depth_m
+def _check_values(depths: Sequence[DepthArray], config: Config) -> Iterator[Finding]:
+    """Yield the findings on the depths themselves, by the typical image."""
     known = [depth[np.isfinite(depth)] for depth in depths]
-    share = float(np.median([np.mean((depth >= low) & (depth <= high)) for depth in known]))
-    return measured(
-        "within limits",
-        share,
-        stream="depth",
-        text=f"{share:.1%} of the known depth within {low:g} .. {high:g} m",
+    median_m = _typical([float(np.nanmedian(depth)) for depth in depths])
+    yield measured("depth: scale", median_m, text=f"median {median_m:.3g} m")
+    low, high = config.depth.min_depth_m, config.depth.max_depth_m
+    share = _typical([float(np.mean((each >= low) & (each <= high))) for each in known])
+    text = f"{share:.1%} of the known depth within {low:g} .. {high:g} m"
+    yield measured("depth: within limits", share, text=text)
+    share = _typical(
+        [1.0 - len(each) / depth.size for each, depth in zip(known, depths, strict=True)]
     )
+    yield measured("depth: unknown", share, text=f"{share:.1%} of the pixels")
+    n_levels = _typical([len(np.unique(each)) for each in known])
+    yield measured("depth: levels", n_levels, text=f"{n_levels:.0f} per image")
 
 
-def _check_holes(depths: Sequence[DepthArray]) -> Finding:
-    share = float(np.median([np.mean(~np.isfinite(depth)) for depth in depths]))
-    return measured("unknown", share, stream="depth", text=f"{share:.1%} of the pixels")
+def _typical(values: Sequence[float]) -> float:
+    return float(np.median(values))
 
 
 def _check_corners(frames: Sequence[RgbdFrame], config: Config) -> Finding:
@@ -269,42 +239,18 @@ def _check_corners(frames: Sequence[RgbdFrame], config: Config) -> Finding:
         corners = detect_corners(frame.image, config.klt.n_corners)
         counts.append(int(np.count_nonzero(sample_depth(frame.depth, corners, config.depth)[1])))
     return measured(
-        "corners with depth",
-        float(np.median(counts)),
-        stream="depth",
+        "depth: corners with depth",
+        _typical(counts),
         fault_low=config.ransac.min_inliers,
-        text=f"{np.median(counts):.0f} per frame (median)",
+        text=f"{_typical(counts):.0f} per frame (median)",
     )
-
-
-def _check_levels(depths: Sequence[DepthArray]) -> Finding:
-    levels = [np.unique(depth[np.isfinite(depth)]) for depth in depths]
-    count = float(np.median([len(values) for values in levels]))
-    steps = [_step_at_median(values) for values in levels]
-    known = [step for step in steps if math.isfinite(step)]
-    step_text = f", steps of {1e3 * float(np.median(known)):.3g} mm at the median" if known else ""
-    return measured("levels", count, stream="depth", text=f"{count:.0f} per image{step_text}")
-
-
-def _step_at_median(values: DepthArray) -> float:
-    if len(values) == 0:
-        return math.nan
-    near = values[np.abs(values / np.median(values) - 1.0) <= _NEAR_MEDIAN]
-    return float(np.median(np.diff(near))) if len(near) > 1 else math.nan
 
 
 def _check_registration(frames: Sequence[RgbdFrame]) -> Finding:
     found = estimate_misregistration(frames)
     if isinstance(found, Failure):
         return unknown("depth: misregistration", found.reason)
-    parts = [
-        f"{axis} {shift:+.1f}" if math.isfinite(shift) else f"{axis} unknown"
-        for axis, shift in zip("uv", found.shift_px, strict=True)
-    ]
+    u, v = (f"{shift:+.1f}" if math.isfinite(shift) else "unknown" for shift in found.shift_px)
     zoom = "" if found.zoom == 1.0 else f", zoom {found.zoom:.2f}"
-    return measured(
-        "misregistration",
-        found.rms_px,
-        stream="depth",
-        text=f"{found.rms_px:.1f} px (depth to colour: {', '.join(parts)}{zoom})",
-    )
+    text = f"{found.rms_px:.1f} px (depth to colour: u {u}, v {v}{zoom})"
+    return measured("depth: misregistration", found.rms_px, text=text)

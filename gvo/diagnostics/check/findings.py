@@ -37,11 +37,6 @@ class Finding:
         what the check needs.
     fix : str
         What to do, one line; may be empty.
-
-    Raises
-    ------
-    ValueError
-        For a finding without a name, or a warning or fault without a fix.
     """
 
     name: str
@@ -58,17 +53,13 @@ class Finding:
             value = getattr(self, key)
             if isinstance(value, str):
                 object.__setattr__(self, key, " ".join(value.split()))
-        if not self.name:
-            raise ValueError(f"a finding needs a name, got {self!r}")
-        if self.verdict in ("warning", "fault") and not self.fix:
-            raise ValueError(f"{self.name}: a {self.verdict} needs a fix")
 
     @property
     def value_text(self) -> str:
         """The value with its unit."""
         if self.text or isinstance(self.value, str):
             return self.text or str(self.value)
-        return f"{_number_text(self.value)} {self.unit}".strip()
+        return f"{number_text(self.value)} {self.unit}".strip()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,66 +101,8 @@ class CheckResult:
         }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Limits:
-    """Range of a value without a warning, and range without a fault.
-
-    Parameters
-    ----------
-    low, high : float
-        Outside is a warning.
-    fault_low, fault_high : float
-        Outside is a fault.
-    """
-
-    low: float = -math.inf
-    high: float = math.inf
-    fault_low: float = -math.inf
-    fault_high: float = math.inf
-
-    def judge(self, value: float) -> Verdict:
-        """Return the verdict on a number; NaN is unknown."""
-        if math.isnan(value):
-            return "unknown"
-        if not self.fault_low <= value <= self.fault_high:
-            return "fault"
-        return "ok" if self.low <= value <= self.high else "warning"
-
-    def describe(self, unit: str = "") -> str:
-        """Return the range as text, the tighter limit on each side."""
-        factor = 100.0 if unit == "%" else 1.0
-        low = factor * max(self.low, self.fault_low)
-        high = factor * min(self.high, self.fault_high)
-        if math.isinf(low) and math.isinf(high):
-            return ""
-        if math.isinf(low):
-            text = f"<= {_number_text(high)}"
-        elif math.isinf(high):
-            text = f">= {_number_text(low)}"
-        else:
-            text = f"{_number_text(low)} .. {_number_text(high)}"
-        return f"{text} {unit}".strip()
-
-
-def judged(
-    name: str, value: str, *, is_ok: bool, threshold: str, fix: str, otherwise: Verdict = "warning"
-) -> Finding:
-    """Return a finding that is ok or not."""
-    return Finding(
-        name=name,
-        value=value,
-        threshold=threshold,
-        verdict="ok" if is_ok else otherwise,
-        fix="" if is_ok else fix,
-    )
-
-
-def unknown(name: str, reason: str) -> Finding:
-    """Return a finding without a verdict, since the recording lacks what the check needs."""
-    return Finding(name=name, value=reason, verdict="unknown")
-
-
-def _number_text(value: float) -> str:
+def number_text(value: float) -> str:
+    """Return a number with three digits."""
     if math.isnan(value):
         return "-"
     if value == 0 or 10 ** (_N_DIGITS - 1) <= abs(value) < _MAX_PLAIN:

@@ -6,8 +6,8 @@ from collections.abc import Collection, Iterator
 
 import numpy as np
 
-from gvo.diagnostics.check.findings import Finding, judged, unknown
-from gvo.diagnostics.check.limits import measured
+from gvo.diagnostics.check.findings import Finding
+from gvo.diagnostics.check.limits import judged, measured, unknown
 from gvo.io.bag.messages import bare
 from gvo.io.poses.tf import TfBuffer
 from gvo.io.poses.truth import TRUTH_FRAMES
@@ -91,6 +91,6 @@ def _check_gaps(
     if len(stamps_ns):
         share = float(np.mean((stamps_ns < first_ns) | (stamps_ns > last_ns)))
         text = f"{share:.1%} of the images"
-        yield measured("images outside", share, stream=name, text=text)
+        yield measured(f"{name}: images outside", share, text=text)
     longest_s = float(np.diff(edge_stamps_ns).max(initial=0)) / 1e9
-    yield measured("gaps", longest_s, stream=name, rule="transform gaps")
+    yield measured(f"{name}: gaps", longest_s, rule="transform gaps")

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from functools import partial
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from gvo.config import Config
-from gvo.diagnostics.check.findings import Finding, unknown
-from gvo.diagnostics.check.limits import MAX_BLUR_PX, lost, measured
+from gvo.diagnostics.check.findings import Finding
+from gvo.diagnostics.check.limits import MAX_BLUR_PX, lost, measured, unknown
 from gvo.diagnostics.check.sampling import Sample
-from gvo.frontend.tracking import detect_corners
+from gvo.frontend.tracking import N_WIDE_LEVELS, detect_corners, track_pixels
 from gvo.types import (
     BoolArray,
     DepthArray,
@@ -35,49 +32,63 @@ _MIN_GRADIENT = 8.0
 _MIN_EDGES = 20
 # Share of the local maxima of the gradient that are taken for edges of things.
 _STRONG_SHARE = 0.3
-_MAX_RETURN_PX = 0.5
-_WINDOW = (15, 15)
-_N_TRACK_LEVELS = 4
 # Share and number of last rows of one value that make an image torn.
 _MIN_TORN_SHARE = 0.05
 _MIN_TORN_ROWS = 4
 
 
-def check_usable(samples: Sequence[Sample]) -> Iterator[Finding]:
-    """Yield the share of the sampled frames that odometry cannot use, with the first reason."""
+def check_usable(samples: Sequence[Sample]) -> Finding:
+    """Return the share of the sampled frames that odometry cannot use, with the first reason."""
     frames = [frame for sample in samples for frame in (sample.first, sample.second)]
     looked_at = [frame for frame in frames if frame is not None]
-    faulty = [frame for frame in looked_at if isinstance(frame, FaultyFrame)]
     if not looked_at:
-        yield unknown("frames that cannot be used", "no frame to look at")
-        return
+        return unknown("frames that cannot be used", "no frame to look at")
+    faulty = [frame for frame in looked_at if isinstance(frame, FaultyFrame)]
     fix = faulty[0].reason if faulty else ""
-    yield lost("frames that cannot be used", len(faulty), len(looked_at), fix)
+    return lost("frames that cannot be used", len(faulty), len(looked_at), fix=fix)
 
 
 def check_images(samples: Sequence[Sample], config: Config) -> Iterator[Finding]:
     """Yield the findings on the grey images of the samples, of both cameras of a stereo pair."""
-    usable = [sample for sample in samples if not isinstance(sample.first, FaultyFrame)]
+    usable = [sample for sample in samples if _grey_images(sample.first)]
+    pairs = [sample for sample in usable if _grey_images(sample.second)]
     if not usable:
         return
     is_stereo = isinstance(usable[0].first, StereoFrame)
     for index, name in enumerate(("left", "right") if is_stereo else ("colour",)):
         images = [_grey_images(sample.first)[index] for sample in usable]
-        pairs = [
+        moving = [
             (_grey_images(sample.first)[index], _grey_images(sample.second)[index])
-            for sample in usable
-            if sample.second is not None and not isinstance(sample.second, FaultyFrame)
+            for sample in pairs
         ]
         yield from _check_exposure(name, images)
         yield from _check_sharpness(name, images)
-        yield from _check_texture(name, images, pairs, config)
-        yield from _check_transfer(name, images, pairs)
+        yield from _check_texture(name, images, moving, config)
+        if moving:
+            yield check_frozen(name, moving)
+        yield _check_torn(name, images)
     if is_stereo:
-        yield _compare_exposures([_grey_images(sample.first) for sample in usable])
+        means = np.array([[image.mean() for image in _grey_images(s.first)] for s in usable]) + 1.0
+        yield measured("left/right: brightness ratio", float(np.median(means[:, 0] / means[:, 1])))
+
+
+def _grey_images(frame: Frame | FaultyFrame | None) -> tuple[ImageArray, ...]:
+    if isinstance(frame, StereoFrame):
+        return (frame.left, frame.right)
+    return (frame.image,) if isinstance(frame, RgbdFrame) else ()
+
+
+def follow_corners(
+    images: tuple[ImageArray, ImageArray], n_corners: int
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return corners of an image, where they are in the next one, and which are found there."""
+    corners = detect_corners(images[0], n_corners)
+    ends, is_found = track_pixels(images, corners, corners, n_levels=N_WIDE_LEVELS, is_checked=True)
+    return corners, ends, is_found
 
 
 def blur_sigma_px(image: ImageArray) -> float:
-    """Estimate the blur of an image: sigma of a Gaussian, pixels.
+    """Estimate the blur of an image: sigma of a Gaussian, pixels; NaN without edges.
 
     At a step edge the gradient of an image smoothed by sigma s falls with
     1 / sqrt(s^2 + blur^2), whatever the contrast. So the blur follows from the ratio of the
@@ -101,122 +112,6 @@ def blur_sigma_px(image: ImageArray) -> float:
     return math.sqrt(numerator / max(ratio - 1.0, 1e-3))
 
 
-def followed_share(first: ImageArray, second: ImageArray, corners: FloatArray) -> float:
-    """Return the share of corners that Lucas-Kanade tracks to the next image and back."""
-    if len(corners) == 0:
-        return 0.0
-    start = corners.astype(np.float32)
-    _, is_followed = follow(first, second, start, start, _MAX_RETURN_PX, maxLevel=_N_TRACK_LEVELS)
-    return float(np.mean(is_followed))
-
-
-def follow(
-    first: ImageArray,
-    second: ImageArray,
-    start: NDArray[np.float32],
-    guess: NDArray[np.float32],
-    max_return_px: float,
-    **options: Any,  # noqa: ANN401 - of cv2.calcOpticalFlowPyrLK
-) -> tuple[NDArray[np.float32], BoolArray]:
-    """Track pixels by Lucas-Kanade; tell which are found, and again on the way back."""
-    track = partial(cv2.calcOpticalFlowPyrLK, winSize=_WINDOW, **options)
-    there, is_there, _ = track(first, second, start, guess.copy())
-    back, is_back, _ = track(second, first, there, start.copy())
-    is_found = (is_there[:, 0] > 0) & (is_back[:, 0] > 0)
-    is_found &= np.linalg.norm(back - start, axis=1) <= max_return_px
-    return np.asarray(there), is_found
-
-
-def n_torn_rows(image: ImageArray) -> int:
-    """Count the rows of one grey value at the bottom, as an interrupted transfer leaves them."""
-    is_varied = np.flatnonzero(np.any(image != image[-1, -1], axis=1))
-    n_rows: int = image.shape[0]
-    return n_rows - 1 - int(is_varied[-1]) if len(is_varied) else n_rows
-
-
-def check_frozen(name: str, pairs: Sequence[tuple[ImageArray | DepthArray, ...]]) -> Finding:
-    """Count the images that equal the one before."""
-    n_frozen = sum(np.array_equal(before, now, equal_nan=True) for before, now in pairs)
-    fix = f"the driver repeats {name} images: record at the camera's own rate"
-    how = " are the same as the one before"
-    return lost(f"{name}: frozen images", n_frozen, len(pairs), fix, how)
-
-
-def _check_exposure(name: str, images: Sequence[ImageArray]) -> Iterator[Finding]:
-    brightness = float(np.median([image.mean() for image in images]))
-    yield measured("brightness", brightness, stream=name)
-    black = float(np.median([np.mean(image <= _BLACK) for image in images]))
-    white = float(np.median([np.mean(image >= _WHITE) for image in images]))
-    yield measured(
-        "clipped pixels",
-        max(black, white),
-        stream=name,
-        text=f"{black:.1%} black, {white:.1%} white",
-        fix=f"{'longer' if black > white else 'shorter'} exposure: clipped pixels hold no corners",
-    )
-
-
-def _check_sharpness(name: str, images: Sequence[ImageArray]) -> Iterator[Finding]:
-    blurs = np.array([blur_sigma_px(image) for image in images])
-    known = blurs[np.isfinite(blurs)]
-    if len(known) == 0:
-        yield unknown(f"{name}: blur", "no edges")
-        return
-    share = float(np.mean(known > MAX_BLUR_PX))
-    yield measured(
-        "blur",
-        float(np.median(known)),
-        stream=name,
-        text=f"{np.median(known):.2f} px, {share:.0%} of frames above",
-    )
-
-
-def _check_texture(
-    name: str, images: Sequence[ImageArray], pairs: Sequence[tuple[ImageArray, ...]], config: Config
-) -> Iterator[Finding]:
-    counts = [len(detect_corners(image, config.klt.n_corners)) for image in images]
-    yield measured(
-        "corners",
-        float(np.median(counts)),
-        stream=name,
-        fault_low=config.ransac.min_inliers,
-        text=f"{np.median(counts):.0f} median, {min(counts)} least of {config.klt.n_corners}",
-    )
-    if not pairs:
-        yield unknown(f"{name}: corners found again", "no two consecutive frames")
-        return
-    shares = [
-        followed_share(first, second, detect_corners(first, config.klt.n_corners))
-        for first, second in pairs
-    ]
-    yield measured(
-        "corners found again",
-        float(np.median(shares)),
-        stream=name,
-        text=f"{np.median(shares):.0%} in the next frame",
-    )
-
-
-def _check_transfer(
-    name: str, images: Sequence[ImageArray], pairs: Sequence[tuple[ImageArray, ...]]
-) -> Iterator[Finding]:
-    if pairs:
-        yield check_frozen(name, pairs)
-    torn = np.array([n_torn_rows(image) for image in images])
-    # Rectification leaves a border without pixels, the same in all images.
-    limit = max(_MIN_TORN_ROWS, _MIN_TORN_SHARE * images[0].shape[0])
-    n_torn = int(np.count_nonzero(torn - torn.min() > limit))
-    fix = "transfers break off: lower rate or size, another cable or port"
-    how = " end in rows of one value"
-    yield lost(f"{name}: torn images", n_torn, len(images), fix, how)
-
-
-def _compare_exposures(pairs: Sequence[tuple[ImageArray, ...]]) -> Finding:
-    ratios = [(left.mean() + 1.0) / (right.mean() + 1.0) for left, right in pairs]
-    ratio = float(np.median(ratios))
-    return measured("brightness ratio", ratio, stream="left/right")
-
-
 def _gradients(image: ImageArray, sigma_px: float) -> FloatArray:
     """Return the size of the gradient of a smoothed image."""
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma_px)
@@ -225,7 +120,64 @@ def _gradients(image: ImageArray, sigma_px: float) -> FloatArray:
     return np.asarray(cv2.magnitude(along_u, along_v))
 
 
-def _grey_images(frame: Frame | FaultyFrame | None) -> tuple[ImageArray, ...]:
-    if isinstance(frame, StereoFrame):
-        return (frame.left, frame.right)
-    return (frame.image,) if isinstance(frame, RgbdFrame) else ()
+def check_frozen(name: str, pairs: Sequence[tuple[ImageArray | DepthArray, ...]]) -> Finding:
+    """Count the images that equal the one before."""
+    n_frozen = sum(np.array_equal(before, now, equal_nan=True) for before, now in pairs)
+    how = " are the same as the one before"
+    return lost(f"{name}: frozen images", n_frozen, len(pairs), how)
+
+
+def _check_exposure(name: str, images: Sequence[ImageArray]) -> Iterator[Finding]:
+    yield measured(f"{name}: brightness", float(np.median([image.mean() for image in images])))
+    black = float(np.median([np.mean(image <= _BLACK) for image in images]))
+    white = float(np.median([np.mean(image >= _WHITE) for image in images]))
+    text = f"{black:.1%} black, {white:.1%} white"
+    yield measured(f"{name}: clipped pixels", max(black, white), text=text)
+
+
+def _check_sharpness(name: str, images: Sequence[ImageArray]) -> Iterator[Finding]:
+    blurs = np.array([blur_sigma_px(image) for image in images])
+    known = blurs[np.isfinite(blurs)]
+    if len(known) == 0:
+        yield unknown(f"{name}: blur", "no edges")
+        return
+    text = f"{np.median(known):.2f} px, {np.mean(known > MAX_BLUR_PX):.0%} of frames above"
+    yield measured(f"{name}: blur", float(np.median(known)), text=text)
+
+
+def _check_texture(
+    name: str,
+    images: Sequence[ImageArray],
+    pairs: Sequence[tuple[ImageArray, ImageArray]],
+    config: Config,
+) -> Iterator[Finding]:
+    n_corners = config.klt.n_corners
+    counts = [len(detect_corners(image, n_corners)) for image in images]
+    yield measured(
+        f"{name}: corners",
+        float(np.median(counts)),
+        fault_low=config.ransac.min_inliers,
+        text=f"{np.median(counts):.0f} median, {min(counts)} least of {n_corners}",
+    )
+    if not pairs:
+        yield unknown(f"{name}: corners found again", "no two consecutive frames")
+        return
+    found = [follow_corners(pair, n_corners)[2] for pair in pairs]
+    share = float(np.median([is_found.mean() if len(is_found) else 0.0 for is_found in found]))
+    yield measured(f"{name}: corners found again", share, text=f"{share:.0%} in the next frame")
+
+
+def _check_torn(name: str, images: Sequence[ImageArray]) -> Finding:
+    """Count the images that an interrupted transfer ends in rows of one grey value."""
+    torn = np.array([n_torn_rows(image) for image in images])
+    # Rectification leaves a border without pixels, the same in all images.
+    limit = max(_MIN_TORN_ROWS, _MIN_TORN_SHARE * images[0].shape[0])
+    n_torn = int(np.count_nonzero(torn - torn.min() > limit))
+    return lost(f"{name}: torn images", n_torn, len(images), " end in rows of one value")
+
+
+def n_torn_rows(image: ImageArray) -> int:
+    """Count the rows of one grey value at the bottom."""
+    is_varied = np.flatnonzero(np.any(image != image[-1, -1], axis=1))
+    n_rows: int = image.shape[0]
+    return n_rows - 1 - int(is_varied[-1]) if len(is_varied) else n_rows

@@ -1,211 +1,229 @@
-"""All limits of `gvo check` in one table, each with the reason for it."""
+"""All limits of `gvo check` in one table, each with the reason for it and with what to do."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from gvo.diagnostics.check.findings import Finding, Limits
+from gvo.diagnostics.check.findings import Finding, Verdict, number_text
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rule:
-    """Limits of a value, its unit, and what to do where it lies outside."""
+    """Range of a value without a warning, range without a fault, and what to do outside."""
 
-    limits: Limits
+    low: float = -math.inf
+    high: float = math.inf
+    fault_low: float = -math.inf
+    fault_high: float = math.inf
     unit: str = ""
     fix: str = ""
+
+    @property
+    def factor(self) -> float:
+        """By which values are multiplied to be shown: shares are in percent."""
+        return 100.0 if self.unit == "%" else 1.0
+
+    @property
+    def threshold(self) -> str:
+        """The range as text, the tighter limit on each side."""
+        low = max(self.low, self.fault_low)
+        high = min(self.high, self.fault_high)
+        lowest, highest = (number_text(self.factor * limit) for limit in (low, high))
+        if math.isinf(low):
+            text = f"<= {highest}"
+        else:
+            text = f">= {lowest}" if math.isinf(high) else f"{lowest} .. {highest}"
+        return f"{text} {self.unit}".strip()
+
+    def judge(self, value: float) -> Verdict:
+        """Return the verdict on a number; NaN is unknown."""
+        if math.isnan(value):
+            return "unknown"
+        if not self.fault_low <= value <= self.fault_high:
+            return "fault"
+        return "ok" if self.low <= value <= self.high else "warning"
 
 
 MAX_BLUR_PX = 1.6
 MAX_CLOCK_JUMP_MS = 100.0
 MIN_STEREO_MATCHES = 60
 MAX_DEPTH_MEDIAN_M = 50.0
-# A share of lost frames, for whatever reason, that costs accuracy, and one that costs most poses.
-LOST = Rule(limits=Limits(high=0.05, fault_high=0.2), unit="%")
 # Streams of one trigger differ by less than 2 ms. A depth camera that runs freely is half a period
 # off at worst; 10 ms are half a pixel of a camera in the hand.
 STAMP_DIFFERENCES_MS = {"stereo": 2.0, "rgbd": 10.0}
 
+# A share of lost frames, for whatever reason, that costs accuracy, and one that costs most poses.
+_LOST = Rule(high=0.05, fault_high=0.2, unit="%")
+_RECTIFIED = "calibrate the pair anew, or check R and P: the topic must be as rectified as they say"
+
 RULES: Mapping[str, Rule] = {
+    "stamps": replace(_LOST, fix="record anew, or sort by header stamp; such frames are skipped"),
+    "dropped frames": replace(
+        _LOST, fix="record with more bandwidth or a smaller rate; each one widens the motion"
+    ),
+    "frames without partner": _LOST,
+    "frames that cannot be used": _LOST,
+    "frozen images": replace(_LOST, fix="the driver repeats images: record at its own rate"),
+    "torn images": replace(
+        _LOST, fix="transfers break off: lower rate or size, another cable or port"
+    ),
     # A period outside is mostly one in another unit.
     "period": Rule(
-        limits=Limits(low=0.5, high=10_000.0),
-        unit="ms",
-        fix="stamps are in another unit than seconds and nanoseconds: mend the driver",
+        low=0.5, high=10_000.0, unit="ms", fix="stamps are in a wrong unit: mend the driver"
     ),
     # Velocities, which predict the next frame, are off by as much.
-    "jitter": Rule(
-        limits=Limits(high=0.3),
-        unit="%",
-        fix="stamp at the exposure in the driver, not where messages arrive",
-    ),
+    "jitter": Rule(high=0.3, unit="%", fix="stamp at the exposure, not where messages arrive"),
     # So long a camera is coasted over with little harm; `window.lost_after_s` is the fault.
-    "gaps": Rule(
-        limits=Limits(high=0.5),
-        unit="s",
-        fix="find what stalled the recording (disk, bandwidth); odometry coasts over it",
-    ),
+    "gaps": Rule(high=0.5, unit="s", fix="find what stalled the recording: disk, bandwidth"),
+    # `STAMP_DIFFERENCES_MS` has the limit of each sensor.
     "stamp difference": Rule(
-        limits=Limits(high=STAMP_DIFFERENCES_MS["stereo"]),
-        unit="ms",
-        fix="trigger both by hardware; a shared offset of the clocks is to be taken off the stamps",
+        unit="ms", fix="trigger both by hardware, or take a shared offset off the stamps"
     ),
     # Messages are late at random by some ten milliseconds; clocks that are set jump by more.
     "clock jump": Rule(
-        limits=Limits(high=MAX_CLOCK_JUMP_MS),
-        unit="ms",
-        fix="a clock was set, or recording stalled: keep time synchronisation from stepping it",
+        high=MAX_CLOCK_JUMP_MS, unit="ms", fix="a clock was set, or recording stalled"
     ),
     # A thousandth: quartz is a hundred times better.
     "clock drift": Rule(
-        limits=Limits(low=-60.0, high=60.0),
-        unit="ms/min",
-        fix="synchronise the camera's clock with the computer's (PTP, NTP)",
+        low=-60.0, high=60.0, unit="ms/min", fix="synchronise the camera's clock (PTP, NTP)"
     ),
     # A baseline outside is mostly one in a wrong unit.
     "baseline": Rule(
-        limits=Limits(low=0.01, high=3.0, fault_low=0.001, fault_high=30.0),
+        low=0.01,
+        high=3.0,
+        fault_low=0.001,
+        fault_high=30.0,
         unit="m",
         fix="P[3] of the right CameraInfo is -fx * baseline in metres",
     ),
     # Of 0 to 255: corners outside have no contrast against the noise.
     "brightness": Rule(
-        limits=Limits(low=25.0, high=230.0),
-        unit="grey",
-        fix="set exposure and gain of the camera, or light the scene",
+        low=25.0, high=230.0, unit="grey", fix="set exposure and gain, or light the scene"
     ),
-    "clipped pixels": Rule(limits=Limits(high=0.3), unit="%"),
+    "clipped pixels": Rule(
+        high=0.3, unit="%", fix="longer exposure where they are black, shorter where white"
+    ),
     # Sharp cameras have 0.3 to 1.3.
     "blur": Rule(
-        limits=Limits(high=MAX_BLUR_PX),
-        unit="px",
-        fix="focus the lens; shorter exposure where the camera moves fast",
+        high=MAX_BLUR_PX, unit="px", fix="focus the lens; shorter exposure in fast motion"
     ),
     # A third of `klt.n_corners`; `ransac.min_inliers` is the fault.
-    "corners": Rule(
-        limits=Limits(low=80.0),
-        fix="more light, texture or contrast in view",
-    ),
+    "corners": Rule(low=80.0, fix="more light, texture or contrast in view"),
     "corners found again": Rule(
-        limits=Limits(low=0.3),
-        unit="%",
-        fix="higher frame rate or slower motion; check that frames are in order",
+        low=0.3, unit="%", fix="higher frame rate or slower motion; are the frames in order?"
     ),
     # Patches are compared without their means, but not without their contrast.
     "brightness ratio": Rule(
-        limits=Limits(low=1.0 / 1.3, high=1.3),
-        fix="let both cameras share exposure and gain",
+        low=1.0 / 1.3, high=1.3, fix="let both cameras share exposure and gain"
     ),
     # A quarter of `klt.n_corners`; `ransac.min_inliers` is the fault.
     "matches": Rule(
-        limits=Limits(low=MIN_STEREO_MATCHES),
-        fix="make sure that the topics are of one pair, in focus, lit and textured",
+        low=MIN_STEREO_MATCHES, fix="check that both topics are of one pair, in focus and lit"
     ),
     # Rows are searched within 1.5 px (`stereo.row_tolerance_px`): half of that.
-    "row offset": Rule(limits=Limits(fault_low=-0.75, fault_high=0.75), unit="px"),
+    "row offset": Rule(fault_low=-0.75, fault_high=0.75, unit="px", fix=_RECTIFIED),
     # Beyond, 5 % of the matches and more are not found on their rows.
-    "row spread": Rule(limits=Limits(fault_high=2.0), unit="px"),
+    "row spread": Rule(fault_high=2.0, unit="px", fix=_RECTIFIED),
     # Lenses of raw images have 0.2 to 0.4; what rectification leaves is a tenth of that.
     "lens distortion": Rule(
-        limits=Limits(fault_low=-0.15, fault_high=0.15),
-        fix="the images are raw or wrongly calibrated: choose the raw topics with their D, or give "
-        "a --calibration FILE with D",
+        fault_low=-0.15,
+        fault_high=0.15,
+        fix="raw or wrongly calibrated images: give the raw topics or a --calibration with D",
     ),
     # Wrong matches alone make a few percent; of exchanged cameras nearly all are negative.
-    "order": Rule(limits=Limits(high=0.1, fault_high=0.5), unit="%"),
+    "order": Rule(
+        high=0.1, fault_high=0.5, unit="%", fix="the rectification turns the cameras apart"
+    ),
     # Outside is a wrong factor: no camera sees half of a scene so near or so far.
-    "scale": Rule(limits=Limits(fault_low=0.2, fault_high=MAX_DEPTH_MEDIAN_M), unit="m"),
+    "scale": Rule(
+        fault_low=0.2,
+        fault_high=MAX_DEPTH_MEDIAN_M,
+        unit="m",
+        fix="set depth.scale to the counts per metre: 1000 for millimetres, 5000 for TUM",
+    ),
     "within limits": Rule(
-        limits=Limits(low=0.5, fault_low=0.05),
-        unit="%",
-        fix="check depth.scale, then depth.min_depth_m and depth.max_depth_m",
+        low=0.5, fault_low=0.05, unit="%", fix="check depth.scale, depth.min_depth_m, max_depth_m"
     ),
     "unknown": Rule(
-        limits=Limits(high=0.5, fault_high=0.75),
-        unit="%",
-        fix="sunlight, dark or shiny surfaces, or too near: depth is missing there",
+        high=0.5, fault_high=0.75, unit="%", fix="sunlight, dark, shiny or near surfaces give none"
     ),
     "corners with depth": Rule(
-        limits=Limits(low=MIN_STEREO_MATCHES),
-        fix="more light or texture, nearer things; depth that is noisy, full of holes, out of "
-        "range or not registered to colour is of no use at corners",
+        low=MIN_STEREO_MATCHES, fix="more light or texture, nearer things; see the depth's faults"
     ),
     # Depth of 8 bits has 256 levels over its whole range, a sound image thousands.
     "levels": Rule(
-        limits=Limits(low=64.0, fault_low=16.0),
-        fix="record 16UC1 or 32FC1: depth of 8 bits, or constant, is of no use",
+        low=64.0, fault_low=16.0, fix="record 16UC1 or 32FC1: depth of 8 bits is of no use"
     ),
     # Drivers register to two or three pixels.
     "misregistration": Rule(
-        limits=Limits(high=3.0, fault_high=6.0),
+        high=3.0,
+        fault_high=6.0,
         unit="px",
-        fix="register depth to colour: record the depth camera's CameraInfo and tf, or switch on "
-        "the driver's registration; late stamps look alike",
+        fix="register depth to colour in the driver, or record the depth camera's CameraInfo and "
+        "tf; late stamps look alike",
     ),
     "images outside": Rule(
-        limits=Limits(high=LOST.limits.high + LOST.limits.fault_high),
-        unit="%",
-        fix="transforms start late or end early, or are stamped by another clock",
+        high=0.25, unit="%", fix="transforms start late, end early, or are of another clock"
     ),
     # As long as the gaps of images.
-    "transform gaps": Rule(
-        limits=Limits(high=0.5),
-        unit="s",
-        fix="transforms were lost: poses are interpolated over the gap",
-    ),
+    "transform gaps": Rule(high=0.5, unit="s", fix="transforms were lost: poses are interpolated"),
 }
 """By what is checked, without the name of the stream."""
 
 
 def measured(
-    what: str,
-    value: float,
-    *,
-    stream: str = "",
-    rule: str = "",
-    text: str = "",
-    fix: str = "",
-    **others: float,
+    name: str, value: float, *, rule: str = "", text: str = "", fix: str = "", **limits: float
 ) -> Finding:
-    """Compare a number with the limits of its rule; shares are in [0, 1], shown in percent.
+    """Compare a number with the limits of its rule.
 
     Parameters
     ----------
-    what : str
-        Key of `RULES`, and name of the finding after that of its stream.
+    name : str
+        What is checked, after the name of its stream and a colon.
     value : float
-        NaN: unknown.
-    stream : str
+        Shares are in [0, 1]; NaN: unknown.
     rule : str
-        Key of `RULES`, where it is another.
+        Key of `RULES`, where it is not what is checked.
     text : str
         Shown in place of the number, if not empty.
     fix : str
         In place of that of the rule.
-    **others
-        Fields of `Limits` that the configuration gives.
+    **limits
+        Of the rule, as the configuration gives them.
     """
-    known = RULES[rule or what]
-    name = f"{stream}: {what}" if stream else what
-    limits = replace(known.limits, **others)
-    return _judge(name, value, limits, known.unit, text=text, fix=fix or known.fix)
-
-
-def lost(name: str, n: int, n_frames: int, fix: str, how: str = "") -> Finding:
-    """Compare the share of frames that are lost, for whatever reason, with its limits."""
-    text = f"{n} of {n_frames}{how}"
-    return _judge(name, n / n_frames, LOST.limits, LOST.unit, text=text, fix=fix)
-
-
-def _judge(name: str, value: float, limits: Limits, unit: str, *, text: str, fix: str) -> Finding:
-    verdict = limits.judge(value)
+    known = replace(RULES[rule or name.rpartition(": ")[2]], **limits)  # type: ignore[arg-type]
+    verdict = known.judge(value)
     return Finding(
         name=name,
-        value=float(value) * (100.0 if unit == "%" else 1.0),
-        unit=unit,
+        value=known.factor * float(value),
+        unit=known.unit,
         text=text,
-        threshold=limits.describe(unit),
+        threshold=known.threshold,
         verdict=verdict,
-        fix=fix if verdict in ("warning", "fault") else "",
+        fix=(fix or known.fix) if verdict in ("warning", "fault") else "",
     )
+
+
+def lost(name: str, n: int, n_frames: int, how: str = "", fix: str = "") -> Finding:
+    """Compare the share of frames that are lost with its limits."""
+    return measured(name, n / n_frames, text=f"{n} of {n_frames}{how}", fix=fix)
+
+
+def judged(
+    name: str, value: str, *, is_ok: bool, threshold: str, fix: str, otherwise: Verdict = "warning"
+) -> Finding:
+    """Return a finding that is ok or not."""
+    return Finding(
+        name=name,
+        value=value,
+        threshold=threshold,
+        verdict="ok" if is_ok else otherwise,
+        fix="" if is_ok else fix,
+    )
+
+
+def unknown(name: str, reason: str) -> Finding:
+    """Return a finding without a verdict, since the recording lacks what the check needs."""
+    return Finding(name=name, value=reason, verdict="unknown")

@@ -8,13 +8,14 @@ import numpy as np
 
 from gvo.config import Config
 from gvo.diagnostics.check.depth import check_depth
-from gvo.diagnostics.check.findings import CheckResult, Finding, judged
+from gvo.diagnostics.check.findings import CheckResult, Finding
 from gvo.diagnostics.check.frame_tree import check_frame_tree
 from gvo.diagnostics.check.images import check_images, check_usable
-from gvo.diagnostics.check.limits import measured
+from gvo.diagnostics.check.limits import judged, measured
 from gvo.diagnostics.check.sampling import Survey, survey
+from gvo.diagnostics.check.shutter import check_shutter
 from gvo.diagnostics.check.stereo import check_stereo
-from gvo.diagnostics.check.timing import check_shutter, check_timing
+from gvo.diagnostics.check.timing import check_timing
 from gvo.errors import CalibrationError
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.io.bag.source import CAMERA_CHANGED, describe_camera_changes
@@ -63,13 +64,13 @@ def check_recording(
     """
     config = config or Config()
     found = survey(source, config, n_samples=n_samples or config.check.n_samples)
-    info, stamps_ns = source.info, found.streams[0].stamps_ns
+    info, stamps_ns = source.info, found.stamps_ns[0]
     camera = _find_camera(info)
     findings = [
         *_describe(info, found),
         *_describe_camera(camera),
         *check_timing(found, info, config),
-        *check_usable(found.samples),
+        check_usable(found.samples),
         *check_images(found.samples, config),
     ]
     if info.sensor == "rgbd":
@@ -80,32 +81,28 @@ def check_recording(
         findings += check_shutter(source, found, config)
     changes = describe_camera_changes(source)
     if changes is not None:
-        findings.append(_check_changes(changes))
+        findings.append(
+            judged(
+                "changed CameraInfo",
+                changes or "0 messages differ from the first",
+                is_ok=not changes,
+                threshold="0",
+                fix=CAMERA_CHANGED,
+            )
+        )
     if transforms is not None:
         findings += check_frame_tree(transforms, info.frame_id, stamps_ns, base_frame=base_frame)
     return CheckResult(recording=info.name, findings=tuple(findings))
 
 
-def _check_changes(changes: str) -> Finding:
-    return judged(
-        "changed CameraInfo",
-        changes or "0 messages differ from the first",
-        is_ok=not changes,
-        threshold="0",
-        fix=CAMERA_CHANGED,
-    )
-
-
 def _describe(info: RecordingInfo, found: Survey) -> Iterator[Finding]:
     """Yield the content of the recording and what odometry will use of it."""
-    first = info.calibrations[0]
-    stamps_ns = found.streams[0].stamps_ns
+    first, stamps_ns = info.calibrations[0], found.stamps_ns[0]
     duration_s = float(np.ptp(stamps_ns)) / 1e9 if len(stamps_ns) else 0.0
-    yield Finding(
-        name="recording",
-        value=f"{info.sensor}, {' + '.join(str(len(s.stamps_ns)) for s in found.streams)} images "
-        f"of {first.width}x{first.height}, {duration_s:.1f} s",
-    )
+    counts = " + ".join(str(len(each)) for each in found.stamps_ns)
+    size = f"{first.width}x{first.height}"
+    value = f"{info.sensor}, {counts} images of {size}, {duration_s:.1f} s"
+    yield Finding(name="recording", value=value)
     for number, decision in enumerate(info.decisions, start=1):
         yield Finding(name=f"source {number}", value=decision)
     yield judged(

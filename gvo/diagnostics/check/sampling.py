@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterable, Iterator
+from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
 
 import numpy as np
 
-from gvo.config import Config, SyncConfig
+from gvo.config import Config
 from gvo.errors import GvoError
 from gvo.io.frames import frames, paired
-from gvo.io.recording import ChosenImages, RecordingInfo, Source, StampedImage
+from gvo.io.recording import ChosenImages, Source, StampedImage
 from gvo.io.sync import Pair
 from gvo.types import FaultyFrame, Frame, IntArray
 
@@ -22,34 +23,10 @@ _WIDE_LIMIT_MS = 200.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class StreamStamps:
-    """The stamps of one stream, in the order of the recording.
-
-    Parameters
-    ----------
-    stamps_ns : ndarray of int64, shape (n,)
-        Stamps of the headers.
-    log_times_ns : ndarray of int64, shape (m,)
-        Times of recording, for the images that have both; empty if the recording has no clock.
-    headers_ns : ndarray of int64, shape (m,)
-        Stamps of the headers of these images.
-    """
-
-    stamps_ns: IntArray
-    log_times_ns: IntArray
-    headers_ns: IntArray
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sample:
-    """A frame and the one after it.
+    """A frame and the one after it, None at the end; their stamps play no role.
 
-    Parameters
-    ----------
-    first, second : StereoFrame, RgbdFrame or FaultyFrame
-        `second` is None at the end of the recording. Their stamps play no role.
-    stamp_ns : int
-        Of the first in the recording, nanoseconds.
+    `stamp_ns` is that of the first in the recording.
     """
 
     first: Frame | FaultyFrame
@@ -63,7 +40,10 @@ class Survey:
 
     Parameters
     ----------
-    streams : tuple of two StreamStamps
+    stamps_ns : tuple of two ndarray of int64, shape (n,)
+        Of both streams, in the order of the recording.
+    log_times_ns : tuple of two ndarray of int64, shape (n,)
+        When these images were recorded; empty if the recording has no clock.
     n_pairs : int
         Number of frames that odometry gets.
     samples : tuple of Sample
@@ -72,7 +52,8 @@ class Survey:
         Why the recording could not be read to its end; empty if it could.
     """
 
-    streams: tuple[StreamStamps, StreamStamps]
+    stamps_ns: tuple[IntArray, IntArray]
+    log_times_ns: tuple[IntArray, IntArray]
     n_pairs: int
     samples: tuple[Sample, ...]
     damage: str
@@ -80,70 +61,57 @@ class Survey:
 
 def survey(source: Source, config: Config, *, n_samples: int) -> Survey:
     """Read all stamps of a recording, and decode a sample of its frames as for odometry."""
-    pass_ = _Pass(source, config.sync, n_samples)
-    pass_.run()
-    n_pairs = pass_.n_pairs
-    if n_pairs == 0 and all(len(stamps) for stamps in pass_.stamps):
-        pass_ = _Pass(source, config.sync, n_samples)
-        pass_.run(_WIDE_LIMIT_MS)
-    streams = pass_.stream(0), pass_.stream(1)
-    samples = _load(source.info, config, pass_.chosen)
-    return Survey(streams=streams, n_pairs=n_pairs, samples=samples, damage=pass_.damage)
+    found = _Pass(source, config, n_samples)
+    n_pairs = found.n_pairs
+    if n_pairs == 0 and all(found.stamps_ns):
+        found = _Pass(source, config, n_samples, limit_ms=_WIDE_LIMIT_MS)
+    first, second = (np.array(each, dtype=np.int64) for each in found.stamps_ns)
+    first_log, second_log = (np.array(each, dtype=np.int64) for each in found.log_times_ns)
+    return Survey(
+        stamps_ns=(first, second),
+        log_times_ns=(first_log, second_log),
+        n_pairs=n_pairs,
+        samples=tuple(_load(source, config, found.chosen)),
+        damage=found.damage,
+    )
 
 
 class _Pass:
-    """Goes once over the images of a recording."""
+    """What is found in one pass over the images of a recording."""
 
-    def __init__(self, source: Source, sync: SyncConfig, n_samples: int) -> None:
-        self._source, self._sync = source, sync
-        last = max(source.info.n_images - 2, 0)
-        self._due = sorted({round(index) for index in np.linspace(0, last, n_samples).tolist()})
-        self.stamps = (array("q"), array("q"))
-        self._logs = (array("q"), array("q"))
-        self._headers = (array("q"), array("q"))
-        self.n_pairs = 0
-        self.damage = ""
+    def __init__(
+        self, source: Source, config: Config, n_samples: int, *, limit_ms: float | None = None
+    ) -> None:
+        self.stamps_ns = array("q"), array("q")
+        self.log_times_ns = array("q"), array("q")
         self.chosen: list[list[Pair]] = []
-
-    def run(self, limit_ms: float | None = None) -> None:
-        due = iter(self._due)
-        next_due = next(due, None)
+        self.n_pairs, self.damage = 0, ""
+        last = max(source.info.n_images - 2, 0)
+        due = deque(sorted({round(index) for index in np.linspace(0, last, n_samples).tolist()}))
         is_successor = False
-        pairs = paired(self._noted(), self._source.info.sensor, self._sync, limit_ms=limit_ms)
-        for index, item in enumerate(self._until_damage(pairs)):
-            if isinstance(item, FaultyFrame):
-                is_successor = False
-                continue
-            self.n_pairs += 1
-            if is_successor:
-                self.chosen[-1].append(item)
-            is_successor = next_due is not None and index >= next_due
-            if is_successor:
-                self.chosen.append([item])
-                while next_due is not None and index >= next_due:
-                    next_due = next(due, None)
-
-    def stream(self, number: int) -> StreamStamps:
-        """Return the stamps of one stream."""
-        return StreamStamps(
-            stamps_ns=np.array(self.stamps[number], dtype=np.int64),
-            log_times_ns=np.array(self._logs[number], dtype=np.int64),
-            headers_ns=np.array(self._headers[number], dtype=np.int64),
-        )
-
-    def _noted(self) -> Iterator[StampedImage]:
-        for image in self._source.images():
-            self.stamps[image.stream].append(image.stamp_ns)
-            if image.log_time_ns is not None:
-                self._logs[image.stream].append(image.log_time_ns)
-                self._headers[image.stream].append(image.stamp_ns)
-            yield image
-
-    def _until_damage(self, pairs: Iterable[Pair | FaultyFrame]) -> Iterator[Pair | FaultyFrame]:
+        pairs = paired(self._noted(source), source.info.sensor, config.sync, limit_ms=limit_ms)
         try:
-            yield from pairs
+            for index, pair in enumerate(pairs):
+                if isinstance(pair, FaultyFrame):
+                    is_successor = False
+                    continue
+                self.n_pairs += 1
+                if is_successor:
+                    self.chosen[-1].append(pair)
+                is_successor = bool(due) and index >= due[0]
+                if is_successor:
+                    self.chosen.append([pair])
+                while due and index >= due[0]:
+                    due.popleft()
         except GvoError as error:
             self.damage = str(error)
+
+    def _noted(self, source: Source) -> Iterator[StampedImage]:
+        for image in source.images():
+            self.stamps_ns[image.stream].append(image.stamp_ns)
+            if image.log_time_ns is not None:
+                self.log_times_ns[image.stream].append(image.log_time_ns)
+            yield image
 
 
 def _images_of(chosen: list[list[Pair]]) -> Iterator[StampedImage]:
@@ -152,17 +120,14 @@ def _images_of(chosen: list[list[Pair]]) -> Iterator[StampedImage]:
         yield from (replace(image, stamp_ns=index * 1_000_000_000) for image in pair)
 
 
-def _load(info: RecordingInfo, config: Config, chosen: list[list[Pair]]) -> tuple[Sample, ...]:
+def _load(source: Source, config: Config, chosen: list[list[Pair]]) -> Iterator[Sample]:
     # Frozen images are found by a check of their own, which needs them.
     sync = config.sync.model_copy(update={"repeated_images": "keep"})
     config = config.model_copy(update={"sync": sync})
     # As a recording, so that they become frames as all others.
-    loaded = frames(ChosenImages(info=info, images=partial(_images_of, chosen)), config)
-    return tuple(
-        Sample(
-            first=next(loaded),
-            second=next(loaded) if len(run) > 1 else None,
-            stamp_ns=run[0][0].stamp_ns,
-        )
-        for run in chosen
-    )
+    images = ChosenImages(info=source.info, images=partial(_images_of, chosen))
+    loaded = frames(images, config)
+    for run in chosen:
+        first = next(loaded)
+        second = next(loaded) if len(run) > 1 else None
+        yield Sample(first=first, second=second, stamp_ns=run[0][0].stamp_ns)

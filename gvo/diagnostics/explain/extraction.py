@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import cv2
 import numpy as np
 
-from gvo.config import Config, DepthConfig
+from gvo.config import Config
 from gvo.diagnostics.explain.values import Corner, Sorting
 from gvo.frontend.calibration import RigOffsets
 from gvo.frontend.features import FeatureExtractor
@@ -43,33 +43,26 @@ def explain_measured(
     frame: Frame, camera: StereoCamera, config: Config, offsets: RigOffsets
 ) -> Sorting:
     """Sort the keypoints by the tests of their matches in the right image, or of their depth."""
-    is_klt = config.frontend.kind == "klt"
     if isinstance(frame, RgbdFrame):
-        return _sort_depths(frame, config, is_klt=is_klt)
-    sort = _sort_corners if is_klt else _sort_matches
+        return _sort_depths(frame, config)
+    sort = _sort_corners if config.frontend.kind == "klt" else _sort_matches
     return sort(frame, camera, config, offsets)
 
 
-def _sort_depths(frame: RgbdFrame, config: Config, *, is_klt: bool) -> Sorting:
-    if is_klt:
+def _sort_depths(frame: RgbdFrame, config: Config) -> Sorting:
+    if config.frontend.kind == "klt":
         pixels = detect_corners(frame.image, config.klt.n_corners)
     else:
         pixels = FeatureExtractor(config.features).extract(frame.image).keypoints
     depths, is_valid = sample_depth(frame.depth, pixels, config.depth)
-    tests = _depth_tests(depths, is_valid, config.depth)
-    return Sorting(tests=tests, pixels=pixels, values=depths)
-
-
-def _depth_tests(
-    depths: FloatArray, is_valid: BoolArray, config: DepthConfig
-) -> dict[str, BoolArray]:
     with np.errstate(invalid="ignore"):
-        is_in_range = (depths >= config.min_depth_m) & (depths <= config.max_depth_m)
-    return {
+        is_in_range = (depths >= config.depth.min_depth_m) & (depths <= config.depth.max_depth_m)
+    tests = {
         "depth unknown": np.isfinite(depths),
         "depth out of range": is_in_range,
         "depth edge": is_valid,
     }
+    return Sorting(tests=tests, pixels=pixels, values=depths)
 
 
 def _sort_corners(
@@ -143,35 +136,32 @@ def explain_disparity(
     frame: StereoFrame, camera: StereoCamera, measured: Sorting, config: Config
 ) -> Corner | None:
     """Follow one corner of those kept along its row in the right image."""
-    kept = measured.are_kept
-    index = _typical(frame.left, measured.pixels[kept], PATCH_RADIUS_PX)
+    images = frame.left, frame.right
+    ends = measured.pixels[measured.are_kept], measured.partners[measured.are_kept]
+    index = _typical(images[0], ends[0], PATCH_RADIUS_PX)
     if index is None:
         return None
-    pixel, partner = measured.pixels[kept][index], measured.partners[kept][index]
-    highest = min(camera.depth_to_disparity(config.stereo.min_depth_m), pixel[0])
-    disparities = np.arange(0.0, float(highest) + 1.0)
-    return _follow(
-        (frame.left, frame.right),
-        pixel,
-        partner,
-        # From left to right in the image: from the largest disparity to the smallest.
-        columns=(disparities[::-1], pixel[0] - disparities[::-1]),
-        radius=PATCH_RADIUS_PX,
-    )
+    pixel, partner = ends[0][index], ends[1][index]
+    highest = min(float(camera.depth_to_disparity(config.stereo.min_depth_m)), pixel[0])
+    # From left to right in the image: from the largest disparity to the smallest.
+    disparities = np.arange(0.0, highest + 1.0)[::-1]
+    columns = disparities, pixel[0] - disparities
+    return _follow(images, pixel, partner, columns=columns, radius=PATCH_RADIUS_PX)
 
 
 def explain_track(
-    frames: tuple[Frame, Frame], matches: Sorting, inliers: BoolArray, config: Config
+    frames: tuple[Frame, Frame], matches: Sorting, inliers: BoolArray
 ) -> Corner | None:
     """Follow one point from the reference into the current image."""
-    images, radius = (image_of(frames[0]), image_of(frames[1])), WINDOW_RADIUS_PX
+    images = image_of(frames[0]), image_of(frames[1])
     kept = np.flatnonzero(matches.are_kept)[inliers]
-    index = _typical(images[0], matches.pixels[kept], radius)
+    index = _typical(images[0], matches.pixels[kept], WINDOW_RADIUS_PX)
     if index is None:
         return None
     pixel, partner = matches.pixels[kept][index], matches.partners[kept][index]
     steps = np.arange(-_REACH_PX, _REACH_PX + 1.0)
-    return _follow(images, pixel, partner, columns=(steps, partner[0] + steps), radius=radius)
+    columns = steps, partner[0] + steps
+    return _follow(images, pixel, partner, columns=columns, radius=WINDOW_RADIUS_PX)
 
 
 def _typical(image: ImageArray, pixels: FloatArray, radius: int) -> int | None:

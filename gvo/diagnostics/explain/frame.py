@@ -155,10 +155,7 @@ class _Drive:
         links = tuple(self._links(asked, result, before))
         reference_ns = steps[-1].reference.stamp_ns if steps else None
         reference = None if reference_ns is None else before[reference_ns]
-        registration: Registration | None = None
-        attempts: tuple[str, ...] = ()
-        if steps:
-            registration, attempts = explain_registration(own, steps[-1], own.camera, config)
+        registration = explain_registration(own, steps[-1], config) if steps else None
         return FrameExplanation(
             recording=self._name,
             index=index,
@@ -174,7 +171,6 @@ class _Drive:
             measured=measured,
             corner=self._corner(frame, reference, measured, registration),
             registration=registration,
-            attempts=attempts,
             links=links,
         )
 
@@ -185,15 +181,14 @@ class _Drive:
         measured: Sorting,
         registration: Registration | None,
     ) -> Corner | None:
-        own, config = self._frontend.own, self._config
+        own = self._frontend.own
         if not isinstance(own, KltFrontend):
             return None
         if isinstance(frame, StereoFrame):
-            return explain_disparity(frame, own.camera, measured, config)
+            return explain_disparity(frame, own.camera, measured, self._config)
         if reference is None or registration is None:
             return None
-        matches, inliers = registration.matches, registration.inliers
-        return explain_track((reference, frame), matches, inliers, config)
+        return explain_track((reference, frame), registration.matches, registration.inliers)
 
     def _links(
         self, asked: list[Asked], result: FrameResult, frames: dict[int, Frame]

@@ -37,43 +37,35 @@ class Asked(NamedTuple):
     result: RelativePose | Failure
 
 
-class Attempt(NamedTuple):
-    """One way to find the points of a reference: from where, and how widely."""
-
-    prior: MotionPrior | None
-    is_wide: bool
-    measured: Measurements
+# Where the search for points began, whether it was wide, and what it found.
+_Attempt: TypeAlias = tuple[MotionPrior | None, bool, Measurements]
 
 
-def explain_registration(
-    frontend: OwnFrontend, asked: Asked, camera: StereoCamera, config: Config
-) -> tuple[Registration, tuple[str, ...]]:
-    """Repeat a registration step by step; also describe its attempts, one a line.
+def explain_registration(frontend: OwnFrontend, asked: Asked, config: Config) -> Registration:
+    """Repeat a registration step by step.
 
     The same arguments give the same result, so what is shown is what happened.
     """
     attempts = list(_attempts(frontend, asked, config))
-    prior, is_wide, _ = attempts[-1]
-    measured = frontend.measure(asked.reference, asked.current, prior, is_wide=is_wide)
+    prior, is_wide, measured = attempts[-1]
+    start = prior
     if isinstance(frontend, KltFrontend):
         radius_px = float(WINDOW_RADIUS_PX)
         matches = _sort_tracks(frontend, asked, attempts[-1])
         start = None if is_wide else prior
     else:
         radius_px = config.temporal.wide_radius_px if is_wide else config.temporal.radius_px
-        matches = _sort_descriptors(asked, prior, measured, radius_px, camera, config)
-        start = prior
-    found = _find_motion(frontend, measured, start, asked.result, camera, config)
-    words = [_describe(frontend, attempt) for attempt in attempts]
-    answers = [*map(_outcome, attempts[:-1]), _answer(asked.result)]
-    is_predicted = prior is not None and not np.array_equal(prior.T_predicted, np.eye(4))
-    registration = Registration(
-        matches=matches, radius_px=radius_px, is_predicted=is_predicted, **found
+        matches = _sort_descriptors(frontend, asked, attempts[-1], radius_px, config)
+    return Registration(
+        attempts=tuple(_describe(attempts, asked.result)),
+        matches=matches,
+        radius_px=radius_px,
+        is_predicted=prior is not None and not np.array_equal(prior.T_predicted, np.eye(4)),
+        **_find_motion(frontend, measured, start, asked.result, config),
     )
-    return registration, tuple(map(": ".join, zip(words, answers, strict=True)))
 
 
-def _attempts(frontend: OwnFrontend, asked: Asked, config: Config) -> Iterator[Attempt]:
+def _attempts(frontend: OwnFrontend, asked: Asked, config: Config) -> Iterator[_Attempt]:
     """Yield the attempts of a front-end, up to the one that found the result's pixels."""
     given = asked.reference, asked.current
     ways = [(asked.prior, True)]
@@ -81,7 +73,7 @@ def _attempts(frontend: OwnFrontend, asked: Asked, config: Config) -> Iterator[A
         ways.insert(0, (asked.prior, False))
     for prior, is_wide in ways:
         measured = frontend.measure(*given, prior, is_wide=is_wide)
-        yield Attempt(prior, is_wide, measured)
+        yield prior, is_wide, measured
         if _is_end(measured, asked.result):
             return
     start = None if isinstance(frontend, KltFrontend) else asked.prior
@@ -91,7 +83,20 @@ def _attempts(frontend: OwnFrontend, asked: Asked, config: Config) -> Iterator[A
     known = rough or asked.result
     if isinstance(known, RelativePose):
         found = MotionPrior(T_predicted=known.T_reference_current)
-        yield Attempt(found, False, frontend.measure(*given, found, is_wide=False))
+        yield found, False, frontend.measure(*given, found, is_wide=False)
+
+
+def _describe(attempts: list[_Attempt], result: RelativePose | Failure) -> Iterator[str]:
+    """Yield how each attempt searched, and what came of it."""
+    for number, (prior, is_wide, _) in enumerate(attempts, start=1):
+        where = f"around the {'previous' if prior is None else 'predicted'} pixels"
+        if number < len(attempts):
+            answer = "its motion predicts the next attempt" if is_wide else "not registered"
+        elif isinstance(result, Failure):
+            answer = result.reason
+        else:
+            answer = f"registered, {result.n_inliers} inliers of {result.n_matches} matches"
+        yield f"{'wide' if is_wide else 'near'} search {where}: {answer}"
 
 
 def _is_end(measured: Measurements, result: RelativePose | Failure) -> bool:
@@ -100,10 +105,11 @@ def _is_end(measured: Measurements, result: RelativePose | Failure) -> bool:
     return np.array_equal(measured.uvd[1][:, :2], result.pixels_current)
 
 
-def _sort_tracks(frontend: KltFrontend, asked: Asked, attempt: Attempt) -> Sorting:
-    T = np.eye(4) if attempt.prior is None else attempt.prior.T_predicted
+def _sort_tracks(frontend: KltFrontend, asked: Asked, attempt: _Attempt) -> Sorting:
+    prior, is_wide, measured = attempt
+    T = np.eye(4) if prior is None else prior.T_predicted
     expected = frontend.predict(T, asked.reference, asked.current)
-    search: Literal["wide", "near"] = "wide" if attempt.is_wide else "near"
+    search: Literal["wide", "near"] = "wide" if is_wide else "near"
     pixels, is_tracked = frontend.find_tracks(asked.reference, asked.current, expected, search)
     n = len(asked.reference)
     tracked = expected.indices[is_tracked]
@@ -112,22 +118,19 @@ def _sort_tracks(frontend: KltFrontend, asked: Asked, attempt: Attempt) -> Sorti
     tests = {
         "out of view": as_mask(expected.indices, n),
         "track lost": as_mask(tracked, n),
-        "no disparity or depth": as_mask(attempt.measured.matches[:, 0], n),
+        "no disparity or depth": as_mask(measured.matches[:, 0], n),
     }
     source = asked.reference.keypoints
     return Sorting(tests=tests, pixels=source, partners=found, predicted=predicted)
 
 
 def _sort_descriptors(
-    asked: Asked,
-    prior: MotionPrior | None,
-    measured: Measurements,
-    radius_px: float,
-    camera: StereoCamera,
-    config: Config,
+    frontend: OwnFrontend, asked: Asked, attempt: _Attempt, radius_px: float, config: Config
 ) -> Sorting:
+    prior, _, measured = attempt
     reference, current, matches = asked.reference, asked.current, measured.matches
-    expected = predict_pixels(reference, None if prior is None else prior.T_predicted, camera)
+    T = None if prior is None else prior.T_predicted
+    expected = predict_pixels(reference, T, frontend.camera)
     tried = compare_within(reference, current, expected, radius_px)
     n, limits = len(reference), config.temporal
     found, predicted = np.full((n, 2), np.nan), np.full((n, 2), np.nan)
@@ -147,22 +150,21 @@ def _find_motion(
     measured: Measurements,
     prior: MotionPrior | None,
     result: RelativePose | Failure,
-    camera: StereoCamera,
     config: Config,
 ) -> dict[str, Any]:
     """Return the consensus of the matches, and their residuals before and after."""
+    camera = frontend.camera
     step = isinstance(frontend, KltFrontend) or is_step(prior)
     T_start = frontend.calibrated.begin(measured, config, prior=prior, is_step=step)
     matches = frontend.calibrated.prepare(measured, T_start)
     if T_start is None and prior is not None:
         T_start = se3.invert(prior.T_predicted)
-    first, second = measured.frames
-    stamps_ns = first.stamp_ns, second.stamp_ns
+    stamps_ns = measured.frames[0].stamp_ns, measured.frames[1].stamp_ns
     consensus = find_consensus(matches, camera, config, stamps_ns, T_start)
     offset = [0.0, 0.0, frontend.rig_offsets.disparity_px]
     moved = np.abs(matches.target_uvd - (measured.uvd[1] - offset))
     motion: dict[str, Any] = {
-        "consensus": 0,
+        "n_consensus": 0,
         "is_known": False,
         "inliers": np.zeros(len(matches), np.bool_),
         "residuals_px": None,
@@ -171,18 +173,20 @@ def _find_motion(
     }
     if isinstance(consensus, Failure):
         return motion
-    motion["consensus"] = int(np.count_nonzero(consensus.inliers))
+    motion["n_consensus"] = int(np.count_nonzero(consensus.inliers))
     motion["is_known"] = consensus.T_target_source is T_start
     if isinstance(result, Failure):
         return motion | {"inliers": consensus.inliers}
     ends = consensus.T_target_source, se3.invert(result.T_reference_current)
     residuals_px = np.stack([_residuals(T, matches, camera) for T in ends])
     known = StereoResiduals.of(ends[0], matches, camera, huber=config.registration.huber)
-    whitened = np.stack([_whiten(each, known) for each in residuals_px])
+    whitened = residuals_px.transpose(0, 2, 1).copy()
+    for rows in whitened:
+        whiten_in_place(known.columns[6:12], rows)
     return motion | {
         "inliers": result.inliers,
         "residuals_px": residuals_px,
-        "whitened": whitened,
+        "whitened": whitened.transpose(0, 2, 1),
     }
 
 
@@ -190,30 +194,3 @@ def _residuals(T: FloatArray, matches: Correspondences, camera: StereoCamera) ->
     points = se3.transform_points(T, matches.source_points)
     points[points[:, 2] < _MIN_DEPTH_M] = np.nan
     return np.asarray(matches.target_uvd - camera.project_stereo(points))
-
-
-def _whiten(residuals_px: FloatArray, residuals: StereoResiduals) -> FloatArray:
-    rows = residuals_px.T.copy()
-    whiten_in_place(residuals.columns[6:12], rows)
-    return np.ascontiguousarray(rows.T)
-
-
-def _describe(frontend: OwnFrontend, attempt: Attempt) -> str:
-    place = "previous" if attempt.prior is None else "predicted"
-    if not isinstance(frontend, KltFrontend):
-        size = "wide" if attempt.is_wide else "narrow"
-        return f"descriptors in the {size} window around the {place} pixels"
-    if attempt.is_wide:
-        return f"tracks from the {place} pixels, over more levels of the pyramid"
-    return f"tracks from the {place} pixels"
-
-
-def _outcome(attempt: Attempt) -> str:
-    """Tell what came of an attempt that another one followed."""
-    return "its motion is the prediction of the next" if attempt.is_wide else "not registered"
-
-
-def _answer(result: RelativePose | Failure) -> str:
-    if isinstance(result, Failure):
-        return result.reason
-    return f"registered, {result.n_inliers} inliers of {result.n_matches} matches"

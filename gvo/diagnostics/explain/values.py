@@ -21,8 +21,6 @@ from gvo.types import (
     RelativePose,
 )
 
-KEPT = "kept"
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sorting:
@@ -49,33 +47,20 @@ class Sorting:
     values: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """The tests in order, then `kept`."""
-        return (*self.tests, KEPT)
-
-    @property
     def codes(self) -> IntArray:
-        """Indices into the names: of the first test that a pixel fails, shape (n,)."""
-        passed = np.array([*self.tests.values(), np.zeros(len(self), dtype=np.bool_)])
+        """Index of the first test that a pixel fails, their number for those kept, shape (n,)."""
+        passed = np.array([*self.tests.values(), np.zeros(len(self.pixels), dtype=np.bool_)])
         return np.asarray(np.argmin(passed, axis=0))
-
-    def __len__(self) -> int:
-        """Return the number of pixels."""
-        return len(self.pixels)
-
-    def are(self, name: str) -> BoolArray:
-        """Tell which pixels have a name, shape (n,)."""
-        return np.asarray(self.codes == self.names.index(name))
 
     @property
     def are_kept(self) -> BoolArray:
         """Tell which pixels were kept, shape (n,)."""
-        return self.are(KEPT)
+        return np.asarray(self.codes == len(self.tests))
 
     def counts(self) -> dict[str, int]:
-        """Count pixels by name, in the order of the tests."""
-        numbers = np.bincount(self.codes, minlength=len(self.names)).tolist()
-        return dict(zip(self.names, numbers, strict=True))
+        """Count the pixels that fail each test first, and those kept."""
+        numbers = np.bincount(self.codes, minlength=len(self.tests) + 1).tolist()
+        return dict(zip((*self.tests, "kept"), numbers, strict=True))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -89,7 +74,7 @@ class Corner:
     ----------
     pixel, partner : ndarray of float64, shape (2,)
         (u, v) in the first and in the second image.
-    patches : ndarray of float32, shape (2, size, size)
+    patches : ndarray of float64, shape (2, size, size)
     columns : ndarray of float64, shape (n,)
         Disparities of a stereo pair; columns less that of the partner for RGB-D.
     correlations : ndarray of float64, shape (n,)
@@ -112,13 +97,15 @@ class Registration:
 
     Parameters
     ----------
+    attempts : tuple of str
+        All attempts, one a line.
     matches : Sorting
         The points of the reference.
     radius_px : float
         Half size of the windows tracked, or the radius in which descriptors are compared.
     is_predicted : bool
         The search began where a predicted motion shows the points.
-    consensus : int
+    n_consensus : int
         How many matches the refinement began with; 0 where too few agreed.
     is_known : bool
         Most matches agreed with the prediction, so that RANSAC was left out.
@@ -131,10 +118,11 @@ class Registration:
         By how much matches were moved at most to the middle of the exposure.
     """
 
+    attempts: tuple[str, ...]
     matches: Sorting
     radius_px: float
     is_predicted: bool
-    consensus: int
+    n_consensus: int
     is_known: bool
     inliers: BoolArray
     residuals_px: FloatArray | None
@@ -144,22 +132,10 @@ class Registration:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Link:
-    """What an earlier frame contributed.
+    """What an earlier frame, of number `frame`, contributed.
 
-    Parameters
-    ----------
-    frame, stamp_ns : int
-        Its number and stamp.
-    image : ndarray of uint8, shape (height, width)
-    kind : str
-        Of the edge; "keyframe" or "not linked" where there is none.
-    overlap : float
-        Share of its points that this frame shows.
-    chi2 : float or None
-    is_accepted : bool
-    reason : str
-        Why there is no edge.
-    registration : RelativePose, Failure or None
+    `kind` is that of its edge, "keyframe" or "not linked" where there is none, `reason` why;
+    `overlap` is the share of its points that the frame shows.
     """
 
     frame: int
@@ -199,8 +175,6 @@ class FrameExplanation:
     corner : Corner or None
         One of those kept; None for descriptors.
     registration : Registration or None
-    attempts : tuple of str
-        All attempts to register it, one a line.
     links : tuple of Link
         What earlier frames contributed: predecessor first, then the keyframes, oldest first.
     """
@@ -219,13 +193,17 @@ class FrameExplanation:
     measured: Sorting
     corner: Corner | None
     registration: Registration | None
-    attempts: tuple[str, ...]
     links: tuple[Link, ...]
 
     @property
     def image(self) -> ImageArray:
         """The left or colour image."""
         return image_of(self.frame)
+
+    @property
+    def is_klt(self) -> bool:
+        """Whether corners are tracked; else descriptors are compared."""
+        return self.config.frontend.kind == "klt"
 
     @property
     def became_keyframe(self) -> bool:

@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from gvo.diagnostics.explain.values import (
-    Corner,
     FrameExplanation,
     Link,
     Registration,
@@ -50,11 +49,10 @@ _N_COLUMNS = 4
 
 def draw_pictures(explanation: FrameExplanation) -> list[Plot]:
     """Draw the steps that were reached, in order; say of the others why not."""
-    is_klt = explanation.config.frontend.kind == "klt"
     return [
         _draw_measured(explanation),
         _draw_flow(explanation),
-        _draw_corner(explanation) if is_klt else _draw_candidates(explanation),
+        _draw_corner(explanation) if explanation.is_klt else _draw_candidates(explanation),
         _draw_consensus(explanation),
         _draw_links(explanation),
         _draw_times(explanation),
@@ -78,14 +76,14 @@ def _draw_measured(explanation: FrameExplanation) -> Plot:
 
 
 def _draw_disparities(explanation: FrameExplanation, frame: StereoFrame) -> Plot:
-    measured = explanation.measured
-    kept, shape = measured.are_kept, frame.left.shape
+    measured, shape = explanation.measured, frame.left.shape
     heights = [pair_height(shape)]
-    if explanation.config.frontend.kind == "klt":
+    if explanation.is_klt:
         heights.append(image_height(shape, share=1.0 if is_wide(shape) else 0.6))
     figure = new_figure(sum(heights) + 0.4)
     rows = figure.subplots(len(heights), 1, height_ratios=heights, squeeze=False)
     upper, *lower = rows[:, 0]
+    kept = measured.are_kept
     canvas, shift = join_images(frame.left, frame.right)
     show_image(upper, canvas, f"left and right: {kept.sum()} matches, by disparity")
     pixels, disparities = measured.pixels[kept], measured.values[kept]
@@ -96,36 +94,25 @@ def _draw_disparities(explanation: FrameExplanation, frame: StereoFrame) -> Plot
     lines = draw_segments(upper, pixels, ends, array=disparities, **looks)
     upper.scatter(*pixels.T, s=9, c=disparities, cmap="viridis", vmin=low, vmax=high)
     if kept.any():
-        figure.colorbar(
-            lines, ax=upper, fraction=0.02, pad=0.01, extend="max", label="disparity [px]"
-        )
+        label = "disparity [px]"
+        figure.colorbar(lines, ax=upper, fraction=0.02, pad=0.01, extend="max", label=label)
     for axes in lower:  # those of descriptors have a picture of their own
         show_image(axes, frame.left, "corners without a match, by the first test that they failed")
         _draw_reasons(axes, measured)
         legend_below(figure, axes)
-    return _picture("1_measured", _disparity_words(explanation), figure)
-
-
-def _disparity_words(explanation: FrameExplanation) -> str:
     config, camera = explanation.config.stereo, explanation.camera
     low, high = (camera.depth_to_disparity(z) for z in (config.max_depth_m, config.min_depth_m))
-    how = (
-        f"A match lies on the row of its keypoint (within {config.row_tolerance_px:g} px), has "
-        f"about its octave and a descriptor distance of at most {config.max_distance:g}; each is "
-        "the best of the other."
-    )
-    if explanation.config.frontend.kind == "klt":
-        how = (
-            "Each corner is searched along its row by correlation, then to a fraction of a pixel; "
-            "left and right must look alike there."
-        )
-    return (
-        f"Of {len(explanation.measured)} keypoints: {count_words(explanation.measured.counts())}. "
-        f"{how} The depth limits of {config.max_depth_m:g} and {config.min_depth_m:g} m are "
-        f"disparities of {low:.1f} and {high:.1f} px. Learnt of the rig before this frame: "
-        f"disparities are off by {explanation.offset_px:+z.3f} px, rows of the right image by "
+    how = "Corners are searched along their rows by correlation; left and right must look alike."
+    if not explanation.is_klt:
+        how = "Descriptors are compared along the rows; each of a match is the best of the other."
+    words = (
+        f"Of {len(kept)} keypoints: {count_words(measured.counts())}. {how} The depth limits of "
+        f"{config.max_depth_m:g} and {config.min_depth_m:g} m are disparities of {low:.1f} and "
+        f"{high:.1f} px. Learnt of the rig before this frame: disparities are off by "
+        f"{explanation.offset_px:+z.3f} px, rows of the right image by "
         f"{explanation.row_offset_px:+z.3f} px."
     )
+    return _picture("1_measured", words, figure)
 
 
 def _draw_depths(explanation: FrameExplanation, frame: RgbdFrame) -> Plot:
@@ -145,27 +132,27 @@ def _draw_depths(explanation: FrameExplanation, frame: RgbdFrame) -> Plot:
     _draw_reasons(second, measured)
     legend_below(figure, second)
     words = (
-        f"Of {len(measured)} keypoints: {count_words(measured.counts())}. Valid depth is known, "
-        f"lies between {config.min_depth_m:g} and {config.max_depth_m:g} m (depth.min_depth_m, "
-        f"depth.max_depth_m) and varies by at most {100 * config.max_edge_step:g} % within "
-        f"{config.edge_radius_px} px (depth.max_edge_step): at an edge, a shift of a pixel between "
-        "colour and depth moves a point by far."
+        f"Of {len(measured.pixels)} keypoints: {count_words(measured.counts())}. Valid depth lies "
+        f"between {config.min_depth_m:g} and {config.max_depth_m:g} m and varies by at most "
+        f"{100 * config.max_edge_step:g} % within {config.edge_radius_px} px (depth.max_edge_step):"
+        " at an edge, a shift of a pixel between colour and depth moves a point by far."
     )
     return _picture("1_measured", words, figure)
 
 
 def _draw_reasons(axes: Axes, sorting: Sorting, pixels: FloatArray | None = None) -> None:
     """Mark the pixels dropped, or others in their place, by the first test that they failed."""
-    places, counts = sorting.pixels if pixels is None else pixels, sorting.counts()
-    for number, name in enumerate(sorting.names[:-1]):
-        if counts[name]:
+    places, codes = sorting.pixels if pixels is None else pixels, sorting.codes
+    for number, name in enumerate(sorting.tests):
+        failed = codes == number
+        if failed.any():
             axes.plot(
-                *places[sorting.are(name)].T,
+                *places[failed].T,
                 color=_REASONS[number % len(_REASONS)],
                 marker=_MARKERS[number % len(_MARKERS)],
                 linestyle="none",
                 markersize=5.0,
-                label=f"{name}: {counts[name]}",
+                label=f"{name}: {failed.sum()}",
             )
 
 
@@ -175,7 +162,7 @@ def _draw_flow(explanation: FrameExplanation) -> Plot:
         return _not_reached("2_flow", explanation)
     matches, image = registration.matches, explanation.image
     starts, ends = matches.pixels[matches.are_kept], matches.partners[matches.are_kept]
-    if explanation.config.frontend.kind == "klt":
+    if explanation.is_klt:
         share = 1.0 if is_wide(image.shape) else 0.75
         figure = new_figure(image_height(image.shape, share=share) + 0.5)
         axes = figure.subplots()
@@ -195,36 +182,33 @@ def _draw_flow(explanation: FrameExplanation) -> Plot:
 
 
 def _flow_words(explanation: FrameExplanation, registration: Registration) -> str:
-    matches, radius, numbers = registration.matches, registration.radius_px, ""
+    matches, radius = registration.matches, registration.radius_px
     place = "predicted" if registration.is_predicted else "previous"
     how = f"Descriptors are compared within {radius:g} px of the {place} pixels."
-    if explanation.config.frontend.kind == "klt":
+    if explanation.is_klt:
         side = 2 * radius + 1
-        how = (
-            f"Windows of {side:g} x {side:g} px are tracked by Lucas-Kanade from the {place} "
-            "pixels, then measured in 3-D where they end; dropped points are marked where they "
-            "were expected."
-        )
+        how = f"Windows of {side:g} x {side:g} px are tracked from the {place} pixels."
+    text = (
+        f"Of {len(matches.pixels)} points of frame {explanation.reference_index}, the reference: "
+        f"{count_words(matches.counts())}. {how}"
+    )
     kept = matches.are_kept
     if kept.any():
         flow, error = (
             np.linalg.norm(matches.partners[kept] - each[kept], axis=1)
             for each in (matches.pixels, matches.predicted)
         )
-        numbers = (
+        text += (
             f" Points move by {np.median(flow):.1f} px (median, at most {flow.max():.1f}); they "
             f"are {np.median(error):.1f} px (median, at most {error.max():.1f}) from where they "
             "were expected."
         )
     if explanation.readout_ms:
-        numbers += (
+        text += (
             f" For a readout of {explanation.readout_ms:.1f} ms they are moved by at most "
             f"{registration.row_motion_px:.2f} px to the middle of the exposure."
         )
-    return (
-        f"Of {len(matches)} points of frame {explanation.reference_index}, the reference: "
-        f"{count_words(matches.counts())}. {how}{numbers}"
-    )
+    return text
 
 
 def _draw_corner(explanation: FrameExplanation) -> Plot:
@@ -247,26 +231,22 @@ def _draw_corner(explanation: FrameExplanation) -> Plot:
     curve.set(xlabel=what, ylabel="correlation along the row", ylim=(-1.05, 1.05))
     if is_stereo:
         curve.invert_xaxis()
-    return _picture("3_corner", _corner_words(explanation, corner), figure)
-
-
-def _corner_words(explanation: FrameExplanation, corner: Corner) -> str:
     (u, v), size = corner.pixel, len(corner.patches[0])
-    start = (
-        f"Of all corners kept, the one of the median horizontal gradient, at ({u:.0f}, {v:.0f}): "
-        f"its patch of {size} x {size} px in both images, their difference, and the correlation of "
-        "the first with the row of the second. "
+    words = (
+        f"The corner at ({u:.0f}, {v:.0f}), of the median gradient: its patch of {size} x {size} "
+        "px in both images, their difference, and the correlation of the first along the row of "
+        "the second. "
     )
-    if isinstance(explanation.frame, RgbdFrame):
+    if is_stereo:
+        depth_m = explanation.camera.disparity_to_depth(corner.end - explanation.offset_px)
+        words += (
+            f"The search ends at {corner.end:.3f} px, the dashed line: a depth of {depth_m:.2f} m. "
+            "A second peak as high means that the row repeats."
+        )
+    else:
         u, v = corner.partner
-        return f"{start}The track ends at ({u:.2f}, {v:.2f}), the dashed line."
-    offset_px = explanation.offset_px
-    depth = float(explanation.camera.disparity_to_depth(corner.end - offset_px))
-    return (
-        f"{start}The search ends at {corner.end:.3f} px, the dashed line"
-        + (f"; less the learnt {offset_px:+z.3f} px" if offset_px else "")
-        + f" that is a depth of {depth:.2f} m. A second peak as high means that the row repeats."
-    )
+        words += f"The track ends at ({u:.2f}, {v:.2f}), the dashed line."
+    return _picture("3_corner", words, figure)
 
 
 def _draw_candidates(explanation: FrameExplanation) -> Plot:
@@ -357,21 +337,18 @@ def _consensus_words(explanation: FrameExplanation, registration: Registration) 
     if ransac.inlier_metric == "distance":
         limit = f"{ransac.inlier_threshold_m:g} m"
     text = f"A match agrees with a motion if its error is less than {limit}. "
+    n = registration.n_consensus
     if registration.is_known:
-        text += (
-            f"{registration.consensus} of {len(inliers)} agree with the predicted motion: RANSAC "
-            "was not needed. "
-        )
-    elif registration.consensus:
-        text += f"RANSAC found a motion with which {registration.consensus} agree. "
+        text += f"{n} of {len(inliers)} agree with the prediction: RANSAC was not needed. "
+    elif n:
+        text += f"RANSAC found a motion with which {n} agree. "
     if registration.whitened is None:
         return f"{text}No motion was accepted: {explanation.result.reason}."
-    found = registration.whitened[1][inliers]
-    rms = float(np.sqrt(np.nanmean(found**2)))
+    rms = float(np.sqrt(np.nanmean(registration.whitened[1][inliers] ** 2)))
     return (
-        f"{text}Below: measured less predicted, before the refinement and after it, the outer bins "
-        f"with all beyond; {inliers.sum()} inliers are left. In sigmas, from the noise of both "
-        f"frames, their root mean square is {rms:.2f}: 1 where the stated sigmas are right."
+        f"{text}Below: measured less predicted, before the refinement and after it; {inliers.sum()}"
+        f" inliers are left. In sigmas their root mean square is {rms:.2f}: 1 where the stated "
+        "noise is right."
     )
 
 
@@ -414,18 +391,14 @@ def _link_words(explanation: FrameExplanation) -> str:
         f"Edges to earlier frames (blue): {sum(link.is_accepted for link in links)}; at most "
         f"{window.n_links} keyframes are registered (window.n_links). Overlap is the share of its "
         f"points in view; below {window.min_overlap:g} a keyframe is not linked "
-        f"(window.min_overlap). If every overlap is below {window.keyframe_overlap:g}, the frame "
+        f"(window.min_overlap), and where all are below {window.keyframe_overlap:g} the frame "
         "becomes a keyframe itself (window.keyframe_overlap), as this one "
         f"{'did' if explanation.became_keyframe else 'did not'}. Chi2 is the squared residual of "
-        "the edge over its covariance, of 6 degrees of freedom: about 6 or less where the stated "
-        "covariances are right or cautious."
+        "the edge over its covariance: about 6 where that is right."
     )
-    kinds = {link.kind for link in explanation.result.links if link.is_accepted}
-    if "depth" in kinds:
+    if any(link.kind == "depth" and link.is_accepted for link in explanation.result.links):
         text += " Depth alone gave another edge to the predecessor (depth.icp)."
-    reasons = [f"frame {each.frame}: {each.reason}" for each in links if each.kind == "keyframe"]
-    refused = [each for each in reasons if not each.endswith(": ")]
-    return f"{text} Refused: {'; '.join(refused)}." if refused else text
+    return text
 
 
 def _draw_times(explanation: FrameExplanation) -> Plot:

@@ -11,13 +11,17 @@ import numpy as np
 
 from gvo.diagnostics.explain.values import FrameExplanation, Link, Registration, Sorting
 from gvo.errors import ConfigurationError, write_faults
-from gvo.types import ConstantError, Estimate, FloatArray, RelativePose, StereoFrame
+from gvo.types import ConstantError, FloatArray, StereoFrame
 from gvo.viz.explanation.pictures import TITLES, draw_pictures
 from gvo.viz.figures import style
 from gvo.viz.pages import write_page
 
-_RELATIVE = "T_reference_current", "covariance", "n_matches", "n_inliers", "flow_px"
+_RELATIVE = (
+    *("T_reference_current", "covariance", "n_matches", "n_inliers", "flow_px"),
+    "calibration_errors",
+)
 _ESTIMATE = "status", "T_world_frame", "covariance"
+_LINK = "frame", "stamp_ns", "kind", "overlap", "chi2", "is_accepted", "reason"
 
 
 def write_explanation(explanation: FrameExplanation, out: Path) -> list[Path]:
@@ -43,9 +47,7 @@ def write_explanation(explanation: FrameExplanation, out: Path) -> list[Path]:
         pictures = draw_pictures(explanation)
         drawn = [each for each in pictures if each.figure is not None]
         files = {out / f"{each.slug}.png": each.png() for each in drawn}
-        numbers = json.dumps(
-            explanation_json(explanation), indent=2, allow_nan=False, default=_plain
-        )
+        numbers = json.dumps(_numbers(explanation), indent=2, allow_nan=False, default=_plain)
         files[out / "explanation.json"] = numbers.encode()
         with write_faults(ConfigurationError, out):
             out.mkdir(parents=True, exist_ok=True)
@@ -53,13 +55,13 @@ def write_explanation(explanation: FrameExplanation, out: Path) -> list[Path]:
                 (out / f"{name}.png").unlink(missing_ok=True)
             for path, content in files.items():
                 path.write_bytes(content)
-        page = out / "explanation.html"
+        page, found = out / "explanation.html", explanation.registration
         write_page(
             page,
             "explanation.html",
             title=f"{explanation.recording}: frame {explanation.index}",
             summary=_summary(explanation),
-            attempts=explanation.attempts,
+            attempts=[] if found is None else found.attempts,
             plots=pictures,
             poses=_poses(explanation),
         )
@@ -104,12 +106,10 @@ def _pose_words(T: FloatArray, covariance: FloatArray) -> str:
     )
 
 
-def explanation_json(explanation: FrameExplanation) -> dict[str, Any]:
-    """Return the numbers of an explanation as plain values.
-
-    Steps that were not reached are null. Matrices are lists of rows.
-    """
-    result, is_stereo = explanation.result, isinstance(explanation.frame, StereoFrame)
+def _numbers(explanation: FrameExplanation) -> dict[str, Any]:
+    """Return what `explanation.json` holds: null where a step was not reached."""
+    result, found = explanation.result, explanation.registration
+    is_stereo = isinstance(explanation.frame, StereoFrame)
     measured = _count(explanation.measured)
     return {
         "recording": explanation.recording,
@@ -119,18 +119,18 @@ def explanation_json(explanation: FrameExplanation) -> dict[str, Any]:
         "reference_frame": explanation.reference_index,
         "status": result.status.value,
         "reason": result.reason,
-        "attempts": list(explanation.attempts),
+        "attempts": [] if found is None else found.attempts,
         "rig_offset_px": explanation.offset_px,
         "rig_row_offset_px": explanation.row_offset_px,
         "readout_ms": explanation.readout_ms,
         "stereo": measured if is_stereo else None,
         "depth": None if is_stereo else measured,
-        "matches": _matches(explanation.registration),
-        "residuals": _residuals(explanation.registration),
-        "relative_pose": _pick(result.registration, *_RELATIVE, "calibration_errors"),
+        "matches": None if found is None else _matches(found),
+        "residuals": None if found is None else _residuals(found),
+        "relative_pose": _pick(result.registration, *_RELATIVE) or None,
         "raw": _pick(result.raw, *_ESTIMATE),
         "causal": _pick(result.causal, *_ESTIMATE),
-        "links": [_link(each) for each in explanation.links],
+        "links": [_pick(link, *_LINK) | _counts(link) for link in explanation.links],
         "became_keyframe": explanation.became_keyframe,
         "stage_ms": result.stage_ms,
         "configuration": explanation.config.model_dump(),
@@ -141,44 +141,33 @@ def _plain(value: Any) -> Any:  # noqa: ANN401 - arrays and numbers of NumPy, an
     return asdict(value) if isinstance(value, ConstantError) else value.tolist()
 
 
-def _pick(value: RelativePose | Estimate | None, *names: str) -> dict[str, Any] | None:
-    """Return attributes by name; None of None."""
-    return None if value is None else {name: getattr(value, name) for name in names}
+def _pick(value: object, *names: str) -> dict[str, Any]:
+    """Return attributes by name; none of None."""
+    return {} if value is None else {name: getattr(value, name) for name in names}
 
 
 def _count(sorting: Sorting) -> dict[str, int]:
-    return {"n": len(sorting), **sorting.counts()}
+    return {"n": len(sorting.pixels), **sorting.counts()}
 
 
-def _matches(registration: Registration | None) -> dict[str, Any] | None:
-    if registration is None:
-        return None
-    return {
-        "radius_px": registration.radius_px,
-        "is_predicted": registration.is_predicted,
-        "row_motion_px": registration.row_motion_px,
-        "n_consensus": registration.consensus,
-        "is_known": registration.is_known,
-        "n_inliers": int(np.count_nonzero(registration.inliers)),
-        **_count(registration.matches),
-    }
-
-
-def _residuals(registration: Registration | None) -> dict[str, Any] | None:
-    """Return the medians of the absolute residuals, before and after the refinement."""
-    if registration is None or registration.residuals_px is None:
-        return None
-    medians = np.nanmedian(np.abs(registration.residuals_px), axis=1)
-    return {
-        when: dict(zip(("u_px", "v_px", "disparity_px"), row, strict=True))
-        for when, row in zip(("before", "after"), medians.tolist(), strict=True)
-    }
-
-
-def _link(link: Link) -> dict[str, Any]:
+def _counts(link: Link) -> dict[str, int]:
     found = link.registration
-    names = "frame", "stamp_ns", "kind", "overlap", "chi2", "is_accepted", "reason"
-    counts = {
-        name: 0 if found is None else getattr(found, name) for name in ("n_matches", "n_inliers")
-    }
-    return {name: getattr(link, name) for name in names} | counts
+    if found is None:
+        return {"n_matches": 0, "n_inliers": 0}
+    return {"n_matches": found.n_matches, "n_inliers": found.n_inliers}
+
+
+def _matches(found: Registration) -> dict[str, Any]:
+    names = "radius_px", "is_predicted", "row_motion_px", "n_consensus", "is_known"
+    n_inliers = int(np.count_nonzero(found.inliers))
+    return _pick(found, *names) | {"n_inliers": n_inliers} | _count(found.matches)
+
+
+def _residuals(found: Registration) -> dict[str, Any] | None:
+    """Return the medians of the absolute residuals, before and after the refinement."""
+    if found.residuals_px is None:
+        return None
+    medians = np.nanmedian(np.abs(found.residuals_px), axis=1).tolist()
+    names = "u_px", "v_px", "disparity_px"
+    before, after = (dict(zip(names, row, strict=True)) for row in medians)
+    return {"before": before, "after": after}

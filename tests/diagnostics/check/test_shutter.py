@@ -65,7 +65,7 @@ def test_a_camera_that_stands_tells_nothing_of_its_shutter() -> None:
 
 
 def test_three_parts_are_decoded_where_the_camera_moves(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gvo.diagnostics.check.timing._N_FRAMES", 6)
+    monkeypatch.setattr("gvo.diagnostics.check.shutter._N_FRAMES", 6)
     loaded = []
 
     def count(image: StampedImage, number: int) -> StampedImage:

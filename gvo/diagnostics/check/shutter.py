@@ -1,0 +1,131 @@
+"""Whether a rolling shutter reads out row after row, by what odometry learns of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from functools import partial
+from itertools import takewhile
+
+import numpy as np
+
+from gvo.config import Config
+from gvo.diagnostics.check.findings import Finding
+from gvo.diagnostics.check.images import follow_corners
+from gvo.diagnostics.check.sampling import Sample, Survey
+from gvo.errors import GvoError
+from gvo.frontend.klt import image_of
+from gvo.io.frames import frames
+from gvo.io.recording import ChosenImages, Source, StampedImage
+from gvo.odometry.odometry import Odometry
+from gvo.types import FaultyFrame, Frame
+
+# The parts that are looked at, and frames in each.
+_N_PARTS = 3
+_N_FRAMES = 30
+# Images of a stream may come so much later than those of the other.
+_DELAY_NS = 1_000_000_000
+# Largest sigma that is of use, and the difference that is one, in sigmas and at least.
+_MAX_SIGMA_MS = 2.5
+_N_SIGMAS = 3.0
+_MIN_DIFFERENCE_MS = 2.0
+# Links tell the readout best, also those that would add little to the poses.
+_LINK_GAIN = 0.5
+
+
+def check_shutter(source: Source, found: Survey, config: Config) -> Iterator[Finding]:
+    """Yield the readout time of the camera; nothing where the recording does not tell it.
+
+    Odometry runs over three parts of 30 frames, around the samples that move most.
+    """
+    parts = _choose_parts(found, config)
+    learnt = [] if not parts else _learn(source, parts, config)
+    if not learnt:
+        return
+    values_ms, sigmas_ms = np.transpose(learnt)
+    weights = sigmas_ms**-2.0
+    found_ms = float(np.average(values_ms, weights=weights))
+    # The sigma of the mean is not below what the scatter of the parts says.
+    chi2 = float(np.sum(weights * (values_ms - found_ms) ** 2)) / max(len(learnt) - 1, 1)
+    sigma_ms = math.sqrt(max(chi2, 1.0) / weights.sum())
+    if sigma_ms > _MAX_SIGMA_MS:
+        return
+    given_ms = config.camera.readout_ms
+    limit_ms = max(_N_SIGMAS * sigma_ms, _MIN_DIFFERENCE_MS)
+    is_wrong = given_ms is not None and abs(found_ms - given_ms) > limit_ms
+    yield Finding(
+        name="rolling shutter",
+        value=found_ms,
+        unit="ms",
+        text=f"readout {found_ms:z.1f} ms, sigma {sigma_ms:.1f}",
+        threshold="" if given_ms is None else f"{given_ms:g} +/- {limit_ms:.1f} ms",
+        verdict="warning" if is_wrong else "info" if given_ms is None else "ok",
+        fix="--set camera.readout_ms=null learns it" if is_wrong else "",
+    )
+
+
+def _choose_parts(found: Survey, config: Config) -> list[tuple[int, int]]:
+    """Return when parts begin and end, nanoseconds, in order and apart."""
+    stamps_ns = np.unique(found.stamps_ns[0])
+    if len(stamps_ns) < 2:
+        return []
+    half_ns = int(np.median(np.diff(stamps_ns))) * _N_FRAMES // 2
+    moving = [(_flow_px(sample, config), sample.stamp_ns) for sample in found.samples]
+    chosen: list[int] = []
+    for flow_px, stamp_ns in sorted(moving, reverse=True):
+        is_apart = all(abs(stamp_ns - other) > 2 * half_ns for other in chosen)
+        if flow_px > 0.0 and is_apart and len(chosen) < _N_PARTS:
+            chosen.append(stamp_ns)
+    return [(stamp_ns - half_ns, stamp_ns + half_ns) for stamp_ns in sorted(chosen)]
+
+
+def _flow_px(sample: Sample, config: Config) -> float:
+    """Return the median displacement of corners between a frame and the next."""
+    first, second = sample.first, sample.second
+    if second is None or isinstance(first, FaultyFrame) or isinstance(second, FaultyFrame):
+        return 0.0
+    images = image_of(first), image_of(second)
+    corners, ends, is_found = follow_corners(images, config.klt.n_corners)
+    lengths = np.linalg.norm(ends - corners, axis=1)[is_found]
+    return float(np.median(lengths)) if len(lengths) >= config.ransac.min_inliers else 0.0
+
+
+def _learn(
+    source: Source, parts: Sequence[tuple[int, int]], config: Config
+) -> list[tuple[float, float]]:
+    """Return what odometry learns of the readout time in each part, and its sigma, in ms."""
+    learning = {
+        "camera": config.camera.model_copy(update={"readout_ms": None}),
+        "window": config.window.model_copy(update={"link_gain": _LINK_GAIN}),
+    }
+    config = config.model_copy(update=learning)
+    runs = [Odometry(source.info.camera, config) for _ in parts]
+    chosen = ChosenImages(info=source.info, images=partial(_images_of, source, parts))
+    for frame in _usable(chosen, config):
+        part = _part_of(frame.stamp_ns, parts)
+        if part is not None:
+            runs[part].track(frame)
+    readouts = [run.rig_offsets.readout for run in runs if run.rig_offsets is not None]
+    return [(1e3 * each.value, 1e3 * each.sigma) for each in readouts]
+
+
+def _part_of(stamp_ns: int, parts: Sequence[tuple[int, int]]) -> int | None:
+    return next((n for n, (start, end) in enumerate(parts) if start <= stamp_ns <= end), None)
+
+
+def _images_of(source: Source, parts: Sequence[tuple[int, int]]) -> Iterator[StampedImage]:
+    """Yield the images of some parts of a recording."""
+    last_ns = parts[-1][1] + _DELAY_NS
+    for image in takewhile(lambda image: image.stamp_ns < last_ns, source.images()):
+        if _part_of(image.stamp_ns, parts) is not None:
+            yield image
+
+
+def _usable(source: Source, config: Config) -> Iterator[Frame]:
+    """Yield frames up to where a recording is damaged, which is a finding of its own."""
+    try:
+        for frame in frames(source, config, with_unpaired=False):
+            if not isinstance(frame, FaultyFrame):
+                yield frame
+    except GvoError:
+        return
