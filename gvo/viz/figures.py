@@ -119,13 +119,7 @@ class Plot:
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as its suffix says; equal figures give equal files.
-
-    Raises
-    ------
-    TrajectoryError
-        When the file cannot be written.
-    """
+    """Write a figure as its suffix says; equal figures give equal files."""
     suffix = path.suffix.lower()
     with write_faults(TrajectoryError, path), style():
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -139,15 +133,7 @@ def _write(figure: Figure, to: Path | io.BytesIO, suffix: str, **options: Any) -
 
 
 def write_plots(plots: Sequence[Plot], folder: Path) -> list[Path]:
-    """Write each figure as PNG and PDF, numbered in the order of the page.
-
-    Raises
-    ------
-    ConfigurationError
-        When the folder cannot be made.
-    TrajectoryError
-        When a file cannot be written.
-    """
+    """Write each figure as PNG and PDF, numbered in the order of the page."""
     with named_faults(ConfigurationError, f"--plots {folder}", "cannot be made"):
         folder.mkdir(parents=True, exist_ok=True)
     paths = []
@@ -196,18 +182,7 @@ def draw_curve(
     seconds: FloatArray | None = None,
     label: str = "",
 ) -> None:
-    """Draw a curve over increasing x, broken where poses are missing.
-
-    Parameters
-    ----------
-    axes : Axes
-    x, y : ndarray of float64, shape (n,)
-    style : Style
-    seconds : ndarray of float64, shape (n,), optional
-        Stamps by which gaps are found; x where omitted.
-    label : str
-        Entry of the legend; none if empty.
-    """
+    """Draw a curve over increasing x, broken where poses are missing by `seconds` (else by x)."""
     gaps = gaps_before(x if seconds is None else seconds)
     x, y = np.insert(x, gaps, x[gaps]), np.insert(y, gaps, np.nan)
     axes.plot(x, y, label=plain(label) if label else "_", **asdict(style))

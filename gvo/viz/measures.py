@@ -21,21 +21,7 @@ _N_LENGTHS = 8
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Comparison:
-    """An estimate compared with its reference.
-
-    Parameters
-    ----------
-    name : str
-        Of the estimate.
-    trajectory : Trajectory
-        The whole estimate, aligned.
-    reference, estimate : Trajectory
-        The n associated poses of each, aligned.
-    errors_m : ndarray of float64, shape (n,)
-        Position errors, metres.
-    errors_rad : ndarray of float64, shape (n,), or None
-        Angles between the rotations since the first associated pose; None without rotations.
-    """
+    """The associated, aligned poses of an estimate and its reference, with their errors (n,)."""
 
     name: str
     trajectory: Trajectory
@@ -90,17 +76,7 @@ def _paired(truth: Trajectory, estimate: Trajectory, name: str) -> tuple[Traject
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Drift:
-    """Mean errors over segments of the path, by length.
-
-    Parameters
-    ----------
-    lengths_m : ndarray of float64, shape (k,)
-        Metres.
-    translations_pct : ndarray of float64, shape (k,)
-        Percent of the length.
-    rotations_deg_per_m : ndarray of float64, shape (k,)
-    n_segments : ndarray of int64, shape (k,)
-    """
+    """Mean errors over the segments of each length, shape (k,)."""
 
     lengths_m: FloatArray
     translations_pct: FloatArray
@@ -109,24 +85,7 @@ class Drift:
 
 
 def drift_lengths(path_m: float) -> tuple[float, ...]:
-    """Return the segment lengths for a path.
-
-    Parameters
-    ----------
-    path_m : float
-        Length of the path, metres.
-
-    Returns
-    -------
-    tuple of float
-        KITTI's 100 to 800 m for a longer path, else round numbers up to four fifths of it; none
-        for a path under 0.1 m.
-
-    Examples
-    --------
-    >>> drift_lengths(60.0)
-    (5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 45.0)
-    """
+    """Return KITTI's 100 to 800 m for a longer path, else round lengths up to four fifths of it."""
     if path_m > KITTI_SEGMENTS_M[-1]:
         return KITTI_SEGMENTS_M
     if path_m < _MIN_PATH_M:

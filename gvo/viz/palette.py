@@ -82,18 +82,7 @@ DRAWN = {
 
 
 def styles_of(names: Iterable[str]) -> list[Style]:
-    """Return a style for each name: the fixed colour of a word in it, once, or the next free one.
-
-    Parameters
-    ----------
-    names : iterable of str
-        Names with the word "raw", "causal", "smoothed" or "global" have fixed colours.
-
-    Examples
-    --------
-    >>> [style.color for style in styles_of(["out/raw", "mine"])]
-    ['#E69F00', '#0072B2']
-    """
+    """Return styles by name: the fixed colour of a word in it, once, or the next free one."""
     left = dict(ESTIMATES)
     free = itertools.cycle(itertools.product(_LINE_STYLES, OTHERS))
     styles = []

@@ -59,20 +59,7 @@ def open_sink(path: Path) -> Film | PngFolder:
 
 
 class Film:
-    """A film, written under another name in its folder until it is closed.
-
-    Its rate is that of the median of the first eight periods, until which pictures wait in memory.
-
-    Parameters
-    ----------
-    path : Path
-        Ends in a suffix of `CODECS`; its folder is made where it is missing.
-
-    Raises
-    ------
-    RecordingError
-        When the folder or the film cannot be written; so do all methods.
-    """
+    """A film of pictures of one size, under another name in its folder until it is closed."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -87,20 +74,7 @@ class Film:
         self._part = Path(self._folder.name) / f"film{path.suffix.lower()}"
 
     def add(self, picture: ImageArray, stamp_ns: int) -> None:
-        """Encode one more picture.
-
-        Parameters
-        ----------
-        picture : ndarray of uint8, shape (height, width, 3)
-            BGR, of the size of the first; an odd last row or column is cut off.
-        stamp_ns : int
-            When it was taken, nanoseconds.
-
-        Raises
-        ------
-        ValueError
-            When it is of another size.
-        """
+        """Encode one more picture, BGR, taken at a stamp; an odd last row or column is cut off."""
         height, width = picture.shape[:2]
         # Encoders subsample colours by two.
         picture = np.ascontiguousarray(picture[: height & ~1, : width & ~1])
@@ -153,20 +127,7 @@ def count_pictures(path: Path) -> int:
 
 
 class PngFolder:
-    """A folder of numbered PNG files, each written as it comes.
-
-    Parameters
-    ----------
-    path : Path
-        Is made where it is missing.
-    decisions : tuple of str
-        Why it is used, where it was not asked for.
-
-    Raises
-    ------
-    RecordingError
-        When the folder holds something already or cannot be written; so do all methods.
-    """
+    """A folder of numbered PNG files, each written as it comes."""
 
     def __init__(self, path: Path, decisions: tuple[str, ...] = ()) -> None:
         self.path, self.decisions = path, decisions

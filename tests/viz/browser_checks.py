@@ -100,12 +100,6 @@ def n_colours(picture: Picture) -> int:
     return len(np.unique(levels @ np.array([1, 16, 256])))
 
 
-def drawn_share(picture: Picture) -> float:
-    """Return the share of pixels that have another colour than most."""
-    packed = picture.reshape(-1, 3).astype(np.int64) @ np.array([1, 256, 65536])
-    return 1.0 - float(np.unique(packed, return_counts=True)[1].max() / packed.size)
-
-
 def changed_share(before: Picture, after: Picture) -> float:
     """Return the share of pixels that are not the same in two pictures of one size."""
     return float(np.any(before != after, axis=2).mean())

@@ -94,19 +94,14 @@ def test_the_view_is_from_above_as_that_of_the_report(
     reference = curve(0, extents=extents, start=start, is_upright=axes == "xy")
     text = svg_text(tmp_path, reference, {"raw": curve(1, extents=extents)})
     assert "".join(axis for axis in "xyz" if f">{axis} [m]</text>" in text) == axes
+    # Without a truth, too; the panels beside have the axes as labels once more.
+    text = svg_text(tmp_path, None, {"raw": reference})
+    assert "".join(axis for axis in "xyz" if text.count(f">{axis} [m]</text>") == 2) == axes
     world = World.of(reference)
     assert "".join("xyz"[axis] for axis in world.ground) == axes
     assert ("xyz"[world.up], world.is_up_negative) == (
         ("y", True) if axes == "xz" else ("z", False)
     )
-
-
-def test_a_robot_without_truth_is_seen_from_above_too(tmp_path: Path) -> None:
-    """The panels beside have the axes as labels, the view has two of them once more."""
-    for extents, start, axes in (((3.0, 9.0, 5.0), 0.0, "xz"), ((3.0, 5.0, 0.2), 1.0, "xy")):
-        path = curve(0, extents=extents, start=start, is_upright=axes == "xy")
-        text = svg_text(tmp_path, None, {"raw": path})
-        assert "".join(axis for axis in "xyz" if text.count(f">{axis} [m]</text>") == 2) == axes
 
 
 def test_labels_carry_units_names_and_errors(tmp_path: Path) -> None:
@@ -150,16 +145,13 @@ def test_one_pose_and_many_estimates_are_drawn(tmp_path: Path) -> None:
         assert np.all(edge == 255)
 
 
-def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
+def test_a_file_of_another_kind_and_nothing_to_draw_are_refused(tmp_path: Path) -> None:
     for name in ("plot.bmp", "plot"):
         with pytest.raises(ConfigurationError, match=r"ending in \.png, \.pdf, \.svg"):
             plot_trajectories(tmp_path / name, None, {"raw": curve(0)})
     (tmp_path / "file").write_text("")
     with pytest.raises(TrajectoryError, match="cannot be written"):
         plot_trajectories(tmp_path / "file" / "plot.png", None, {"raw": curve(0)})
-
-
-def test_nothing_to_draw_is_refused(tmp_path: Path) -> None:
     for estimates in ({}, {"raw": curve(0).select([])}):
         with pytest.raises(ValueError, match="at least one estimate"):
             plot_trajectories(tmp_path / "plot.png", None, estimates)
@@ -179,16 +171,6 @@ def test_drawing_leaves_the_process_as_it_was(tmp_path: Path) -> None:
     subprocess.run([sys.executable, "-c", program], check=True, cwd=Path(__file__).parents[2])
 
 
-def test_positions_without_rotations_are_drawn_with_their_errors(tmp_path: Path) -> None:
-    reference = curve(0)
-    points = Trajectory.of_positions(
-        reference.stamps_ns[::7] + 33_000_000, reference.positions[::7], stamps_from="topic"
-    )
-    text = svg_text(tmp_path, points, {"raw": curve(1)})
-    assert "position error [m]" in text
-    assert "raw (ATE" in text
-
-
 def test_the_plane_of_positions_is_that_of_their_motion(tmp_path: Path) -> None:
     """They begin with an identity that means nothing: it makes no world of a camera."""
     path = curve(0, extents=(3.0, 5.0, 0.5))
@@ -202,3 +184,4 @@ def test_the_plane_of_positions_is_that_of_their_motion(tmp_path: Path) -> None:
         )
     }
     assert axes == {"camera": ["x", "z"], "points": ["x", "y"]}
+    assert "raw (ATE" in svg_text(tmp_path, points, {"raw": path})

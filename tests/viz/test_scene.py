@@ -21,7 +21,7 @@ from gvo.viz.scene import (
     scene,
 )
 from tests.results import estimate_at, loop_of
-from tests.viz.view.fakes import PERIOD_NS, loop_between, pose_of, registration_of, result_of
+from tests.viz.view.fakes import PERIOD_NS, pose_of, registration_of, result_of
 
 
 def history_of(n: int) -> History:
@@ -63,7 +63,7 @@ def test_a_thinned_path_keeps_its_poses_while_it_grows(n: int, n_most: int) -> N
 
 def test_a_scene_names_what_is_drawn() -> None:
     history = history_of(5)
-    result = replace(result_of(5), loops=(loop_between(5 * PERIOD_NS, PERIOD_NS),))
+    result = replace(result_of(5), loops=(loop_of(5 * PERIOD_NS, PERIOD_NS),))
     history.add(result)
     seen = scene(result, history)
     np.testing.assert_array_equal(seen.lines["step"][:, :, 2], [[4.0, 5.0]])

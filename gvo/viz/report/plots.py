@@ -20,7 +20,7 @@ from gvo.trajectory.evaluation import (
     Consistency,
     chi2_bound,
 )
-from gvo.types import FloatArray, IntArray
+from gvo.types import FloatArray
 from gvo.viz import palette
 from gvo.viz.figures import (
     MANY,
@@ -49,7 +49,6 @@ _PANELS = (
     *((3, "x", "m"), (4, "y", "m"), (5, "z", "m")),
     *((0, "x", "deg"), (1, "y", "deg"), (2, "z", "deg")),
 )
-_N_RIBBON = 400  # columns of the ribbon: a single frame must be visible
 _UNKNOWN = "#999999"
 _FLOOR = 1e-3  # of the logarithmic axis
 _MARKERS = {"step": "o", "keyframe": "s", "depth": "^"}
@@ -243,16 +242,17 @@ def _ribbon(frames: Table) -> Figure:
     figure = new_figure(0.85 + 0.32 * len(names))
     axes = figure.subplots()
     x = elapsed(frames["stamp_ns"], int(frames["stamp_ns"][0]))
+    period_s = float(np.median(np.diff(np.unique(x)))) if x[-1] > x[0] else 1.0
     statuses = frames["status"]
     for row, name in enumerate(names):
-        axes.broken_barh(
-            _spans(x, statuses == name),
-            (row - 0.4, 0.8),
-            facecolor=palette.STATUSES.get(name, _UNKNOWN),
-            hatch=palette.HATCHES.get(name, ""),
-            edgecolor="black" if palette.HATCHES.get(name) else "none",
-            linewidth=0.0,
-        )
+        colour, hatch = palette.STATUSES.get(name, _UNKNOWN), palette.HATCHES.get(name, "")
+        spans = _spans(x[statuses == name], period_s)
+        # The edge widens single frames to be seen.
+        looks: dict[str, Any] = {"facecolor": colour, "edgecolor": colour, "linewidth": 1.0}
+        axes.broken_barh(spans, (row - 0.4, 0.8), **looks)
+        if hatch:
+            looks = {"facecolor": "none", "edgecolor": "black", "linewidth": 0.0, "hatch": hatch}
+            axes.broken_barh(spans, (row - 0.4, 0.8), **looks)
     axes.set_yticks(range(len(names)), [f"{name}: {counts[name]}" for name in names])
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.grid(axis="y", visible=False)
@@ -261,26 +261,11 @@ def _ribbon(frames: Table) -> Figure:
     return figure
 
 
-def _spans(x: FloatArray, is_there: Any) -> list[tuple[float, float]]:  # noqa: ANN401
-    """Return start and width of each stretch of a status, at least a column wide."""
-    extent = max(float(x[-1] - x[0]), 1e-9)
-    step = float(np.median(np.diff(np.unique(x)))) if x[-1] > x[0] else extent
-    n_columns = max(1, min(_N_RIBBON, round(extent / step) + 1))
-    marks = np.zeros(n_columns + 2, dtype=np.int64)
-    marks[1 + _columns_of(x, n_columns)[is_there]] = 1
-    edges = np.flatnonzero(np.diff(marks)).reshape(-1, 2)
-    width = (extent + step) / n_columns if len(x) > 1 else 1.0
-    starts, widths = x[0] + edges[:, 0] * width, (edges[:, 1] - edges[:, 0]) * width
-    return [(float(a), float(b)) for a, b in zip(starts, widths, strict=True)]
-
-
-def _columns_of(x: FloatArray, n_columns: int) -> IntArray:
-    """Return the column of each increasing x, from 0 to n_columns - 1."""
-    extent = float(x[-1] - x[0])
-    if extent <= 0.0:
-        return np.zeros(len(x), dtype=np.int64)
-    columns = np.minimum((x - x[0]) / extent * n_columns, n_columns - 1)
-    return np.asarray(columns, dtype=np.int64)
+def _spans(seconds: FloatArray, period_s: float) -> list[tuple[float, float]]:
+    """Return start and width of each stretch of frames that follow one another."""
+    ordered = np.unique(seconds)
+    parts = np.split(ordered, np.flatnonzero(np.diff(ordered) > 1.5 * period_s) + 1)
+    return [(float(part[0]), float(part[-1] - part[0]) + period_s) for part in parts]
 
 
 def _time_axes(height: float, label: str) -> tuple[Figure, Axes]:

@@ -225,8 +225,8 @@ def _rgb(image: ImageArray) -> ImageArray:
 def truth_positions(truth: Trajectory, path: Path) -> FloatArray:
     """Return the truth (m, 3) along a path that starts at the origin of its world, metres.
 
-    Where the truth has a rotation at the first frame it starts there too, so that drift shows;
-    else all positions are fitted by a rigid motion.
+    With a rotation at the first frame it starts there too, so that drift shows; else all positions
+    are fitted by a rigid motion.
     """
     stamps_ns, poses = path
     if truth.has_rotations and truth.stamps_ns[0] <= stamps_ns[0] <= truth.stamps_ns[-1]:

@@ -22,29 +22,7 @@ _SECTIONS = ("sync", "images", "runtime")
 
 
 class Tracking:
-    """Reads frames and tracks them.
-
-    Parameters
-    ----------
-    open_source : callable
-        Opens the recording as a configuration says.
-    config : Config
-    first_index : int
-        Number of the frame to start with.
-
-    Attributes
-    ----------
-    config : Config
-        Of the next frame.
-    newest : Newest
-    is_finished : bool
-        The recording was read to its end, or something went wrong for good.
-
-    Raises
-    ------
-    GvoError
-        When the recording cannot be opened, or has no frame of that number.
-    """
+    """Reads the frames of a recording from some frame on, and tracks them one by one."""
 
     def __init__(self, open_source: OpenSource, config: Config, first_index: int = 0) -> None:
         self._open_source, self.config = open_source, config

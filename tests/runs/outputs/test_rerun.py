@@ -35,26 +35,17 @@ from gvo.types import (
     Estimate,
     FaultyFrame,
     FloatArray,
-    FrameLink,
     FrameResult,
     StereoFrame,
 )
 from gvo.viz.palette import COUNTS, LINKS, STAGES
+from tests.make.tracked import MOUNTED, N_FRAMES, START_NS, moved
 from tests.results import estimate_at, loop_of, optimum_of, result_of
 
 pytestmark = pytest.mark.rerun
 
-_N_FRAMES = 12
 _ESTIMATES = ("raw", "causal", "smoothed", "global")
 _CAMERA_ENTITY = "/world/causal/frame/camera"
-_SECOND_NS = 10**9
-_UNIX_NS = 1_403_636_584_763_555_584
-# A camera that looks ahead and 20 degrees down, on a robot whose x points ahead and z up.
-_T_BASE_CAM = make_transform(
-    np.asarray(Rotation.from_euler("ZYX", [-90, 0, -110], degrees=True).as_matrix()),
-    np.array([0.3, -0.1, 0.5]),
-)
-_MOUNTED = RunFrames(base="base_link", camera="left_optical", T_base_cam=_T_BASE_CAM)
 # Up 1, down 2, right 3, left 4, forward 5, back 6.
 _RIGHT_DOWN_FORWARD, _FORWARD_LEFT_UP = [3, 2, 5], [5, 4, 1]
 _CAMERA = StereoCamera(fx=50.0, fy=50.0, cx=31.5, cy=23.5, width=64, height=48, baseline=0.1)
@@ -107,6 +98,10 @@ class _Read:
 
     def numbers(self, entity: str) -> dict[int, float]:
         return {row.stamp_ns: row.values["Scalars:scalars"][0] for row in self.rows[entity]}
+
+    def colour(self, entity: str) -> str:
+        (number,) = self.fixed[entity]["SeriesLines:colors"]
+        return f"#{number >> 8:06X}"
 
 
 def _matrix(values: dict[str, Any]) -> FloatArray:
@@ -175,15 +170,15 @@ def _run(folder: Path, source: SyntheticRecording, names: RunFrames) -> _Run:
 @pytest.fixture(scope="module")
 def room_run(tmp_path_factory: pytest.TempPathFactory) -> _Run:
     """Return a run with an RGB-D camera, whose own poses are asked for."""
-    source = SyntheticRecording("handheld", "rgbd", n_frames=_N_FRAMES, scale=0.5)
+    source = SyntheticRecording("handheld", "rgbd", n_frames=N_FRAMES, scale=0.5)
     return _run(tmp_path_factory.mktemp("room"), source, RunFrames(is_world_optical=True))
 
 
 @pytest.fixture(scope="module")
 def robot_run(tmp_path_factory: pytest.TempPathFactory) -> _Run:
     """Return a run with a stereo camera on a robot, whose poses are asked for."""
-    source = SyntheticRecording("handheld", "stereo", n_frames=_N_FRAMES, scale=0.5)
-    return _run(tmp_path_factory.mktemp("robot"), source, _MOUNTED)
+    source = SyntheticRecording("handheld", "stereo", n_frames=N_FRAMES, scale=0.5)
+    return _run(tmp_path_factory.mktemp("robot"), source, MOUNTED)
 
 
 @pytest.fixture(scope="module", params=["room_run", "robot_run"])
@@ -194,33 +189,22 @@ def any_run(request: pytest.FixtureRequest) -> _Run:
 
 
 @pytest.mark.parametrize("name", _ESTIMATES)
-def test_all_poses_are_those_of_the_run_folder_at_their_stamps(any_run: _Run, name: str) -> None:
-    trajectory = any_run.trajectory(name)
-    poses = any_run.read.poses(f"/world/{name}/frame")
-    assert sorted(poses) == trajectory.stamps_ns.tolist()
-    assert len(poses) == _N_FRAMES
-    placed = np.stack([poses[stamp_ns] for stamp_ns in trajectory.stamps_ns.tolist()])
-    np.testing.assert_allclose(placed, trajectory.T_world_frame, atol=2e-6)
-
-
-@pytest.mark.parametrize("name", _ESTIMATES)
-def test_both_timelines_name_the_same_frames(any_run: _Run, name: str) -> None:
+def test_poses_and_paths_are_those_of_the_run_folder(any_run: _Run, name: str) -> None:
+    trajectory, rows = any_run.trajectory(name), any_run.read.rows[f"/world/{name}/frame"]
     stamps_ns = any_run.trajectory("raw").stamps_ns.tolist()
-    rows = any_run.read.rows[f"/world/{name}/frame"]
+    assert trajectory.stamps_ns.tolist() == stamps_ns
+    # Both timelines name the same frames.
     assert [(row.frame, row.stamp_ns) for row in rows] == list(enumerate(stamps_ns))
-
-
-@pytest.mark.parametrize("name", _ESTIMATES)
-def test_the_last_paths_are_whole(any_run: _Run, name: str) -> None:
-    drawn = _strip(any_run.read.latest(f"/world/{name}/path", _N_FRAMES))
-    positions = any_run.trajectory(name).T_world_frame[:, :3, 3]
-    np.testing.assert_allclose(drawn, positions, atol=2e-6)
+    placed = np.stack([_matrix(row.values) for row in rows])
+    np.testing.assert_allclose(placed, trajectory.T_world_frame, atol=2e-6)
+    path = _strip(any_run.read.latest(f"/world/{name}/path", N_FRAMES))
+    np.testing.assert_allclose(path, trajectory.positions, atol=2e-6)
 
 
 @pytest.mark.parametrize("name", ["raw", "causal"])
 def test_ellipsoids_are_three_sigma_of_the_position_in_the_world(any_run: _Run, name: str) -> None:
     rows = any_run.read.rows[f"/world/{name}/covariance"]
-    assert len(rows) == _N_FRAMES
+    assert len(rows) == N_FRAMES
     for row, result in zip(rows, any_run.results, strict=True):
         _check_ellipsoid(row.values, 0, getattr(result, name))
 
@@ -263,14 +247,14 @@ def test_links_run_from_the_earlier_frame_to_the_newest(any_run: _Run) -> None:
         assert len(strips) == len(segments)
         drawn_ends, ends = np.reshape(strips, (-1, 3)), np.reshape(segments, (-1, 3))
         np.testing.assert_allclose(drawn_ends, ends, atol=2e-6)
-    assert sum(map(len, expected.values())) > _N_FRAMES
+    assert sum(map(len, expected.values())) > N_FRAMES
 
 
 def test_there_are_an_image_and_an_overlay_of_each_frame(any_run: _Run) -> None:
     shapes = {}
     for entity in ("/overlay", f"{_CAMERA_ENTITY}/image"):
         rows = any_run.read.rows[entity]
-        assert [row.frame for row in rows] == list(range(_N_FRAMES))
+        assert [row.frame for row in rows] == list(range(N_FRAMES))
         pictures = [_decode(row.values) for row in rows]
         assert len({picture.shape for picture in pictures}) == 1
         assert all(float(picture.std()) > 5.0 for picture in pictures)
@@ -318,35 +302,24 @@ def test_the_cloud_has_the_inliers_of_each_keyframe_in_the_world(any_run: _Run) 
     assert n_checked > 0
 
 
-def test_numbers_are_those_of_the_tables(any_run: _Run) -> None:
+def test_numbers_are_those_of_the_tables_in_the_colours_of_the_report(any_run: _Run) -> None:
     counted, timed = any_run.table("frames.csv"), any_run.table("timings.csv")
     for name in ("matches", "inliers", "points"):
         expected = {int(row["stamp_ns"]): float(row[f"n_{name}"]) for row in counted}
         assert any_run.read.numbers(f"/counts/{name}") == expected
-    for stage in ("read", "extract", "register", "links", "window"):
+        assert any_run.read.colour(f"/counts/{name}") == COUNTS[name]
+    for stage, code in STAGES.items():
         drawn = any_run.read.numbers(f"/milliseconds/{stage}")
         values = [float(row[f"{stage}_ms"]) for row in timed]
         np.testing.assert_allclose(list(drawn.values()), values, atol=1e-3)
-
-
-def test_lines_have_the_colours_that_the_report_gives_them(any_run: _Run) -> None:
-    expected = {
-        **{f"/counts/{name}": COUNTS[name] for name in ("matches", "inliers", "points")},
-        **{f"/milliseconds/{stage}": code for stage, code in STAGES.items()},
-        "/chi2/keyframe": LINKS["keyframe"],
-    }
-    for entity, code in expected.items():
-        (drawn,) = any_run.read.fixed[entity]["SeriesLines:colors"]
-        assert f"{drawn:08x}" == f"{code[1:].lower()}ff", entity
-
-
-def test_chi2_is_the_mean_of_the_accepted_edges_of_a_kind(any_run: _Run) -> None:
-    expected: dict[int, list[float]] = {}
+        assert any_run.read.colour(f"/milliseconds/{stage}") == code
+    accepted: dict[int, list[float]] = {}
     for edge in any_run.table("edges.csv"):
         if edge["kind"] == "keyframe" and edge["is_accepted"] == "1" and edge["chi2"]:
-            expected.setdefault(int(edge["stamp_ns"]), []).append(float(edge["chi2"]))
-    means = {stamp_ns: np.mean(values) for stamp_ns, values in expected.items()}
+            accepted.setdefault(int(edge["stamp_ns"]), []).append(float(edge["chi2"]))
+    means = {stamp_ns: np.mean(values) for stamp_ns, values in accepted.items()}
     assert any_run.read.numbers("/chi2/keyframe") == pytest.approx(means, rel=1e-3)
+    assert any_run.read.colour("/chi2/keyframe") == LINKS["keyframe"]
     assert means
 
 
@@ -371,11 +344,9 @@ def test_a_placed_camera_tells_where_up_is(tmp_path: Path, down: str, axes: list
     assert read.fixed["/world"]["ViewCoordinates:xyz"][0] == axes
 
 
-def _made(
-    stamp_ns: int, T_world_cam: FloatArray | None = None, *, links: tuple[FrameLink, ...] = ()
-) -> FrameResult:
+def _made(stamp_ns: int, T_world_cam: FloatArray | None = None) -> FrameResult:
     """Make the result of a frame that was not tracked."""
-    return result_of(estimate_at(stamp_ns, T_world_cam), links=links)
+    return result_of(estimate_at(stamp_ns, T_world_cam))
 
 
 def _frame(stamp_ns: int) -> StereoFrame:
@@ -392,7 +363,7 @@ def _write_made(folder: Path, results: list[FrameResult], names: RunFrames | Non
 
 
 @pytest.mark.parametrize(
-    ("start_ns", "kind"), [(0, pa.duration("ns")), (_UNIX_NS, pa.timestamp("ns"))]
+    ("start_ns", "kind"), [(0, pa.duration("ns")), (START_NS, pa.timestamp("ns"))]
 )
 def test_stamps_are_dates_if_they_can_be(tmp_path: Path, start_ns: int, kind: pa.DataType) -> None:
     read = _write_made(tmp_path, [_made(start_ns), _made(start_ns + 1)])
@@ -402,7 +373,7 @@ def test_stamps_are_dates_if_they_can_be(tmp_path: Path, start_ns: int, kind: pa
 
 def test_a_camera_that_moves_in_the_frame_is_placed_at_each_stamp(tmp_path: Path) -> None:
     def mount(stamp_ns: int) -> FloatArray:
-        return make_transform(np.eye(3), np.array([0.0, 1e-3 * stamp_ns, 1.0]))
+        return moved(y=1e-3 * stamp_ns, z=1.0)
 
     names = RunFrames(base="base_link", camera="pan", T_base_cam=mount)
     poses = _write_made(tmp_path, [_made(5), _made(9)], names).poses(_CAMERA_ENTITY)
@@ -412,25 +383,22 @@ def test_a_camera_that_moves_in_the_frame_is_placed_at_each_stamp(tmp_path: Path
 
 
 def test_loops_run_between_causal_poses_and_at_the_end_between_global_ones(tmp_path: Path) -> None:
-    def at(x: float) -> FloatArray:
-        return make_transform(np.eye(3), np.array([x, 0.0, 0.0]))
-
-    results = [_made(10, at(1.0)), _made(20, at(2.0)), _made(30, at(3.0))]
+    results = [_made(10 * k, moved(float(k))) for k in (1, 2, 3)]
     # The place of the second is not known.
     results[2] = replace(results[2], loops=(loop_of(30, 10), loop_of(30, 15)))
-    moved = [replace(each.causal, T_world_frame=at(0.5 * k)) for k, each in enumerate(results)]
-    optimum = optimum_of(moved, loop_of(30, 10), loop_of(30, 20, "contradicts the others"))
+    ends = [replace(r.causal, T_world_frame=moved(0.5 * k)) for k, r in enumerate(results)]
+    optimum = optimum_of(ends, loop_of(30, 10), loop_of(30, 20, "contradicts the others"))
     path = tmp_path / "made.rrd"
     with RunRerun(path, _CAMERA) as file:
         for result in results:
             file.add_frame(_frame(result.stamp_ns), result)
         file.add_optimum(optimum)
     read = _Read(path)
-    for entity, ends in (("/world/loops", (3.0, 1.0)), ("/world/global/loops", (1.0, 0.0))):
+    for entity, places in (("/world/loops", [3.0, 1.0]), ("/world/global/loops", [1.0, 0.0])):
         (row,) = read.rows[entity]
         assert row.stamp_ns == 30
         (strip,) = row.values["LineStrips3D:strips"]
-        assert [point[0] for point in strip] == list(ends)
+        assert [point[0] for point in strip] == places
     assert [point[0] for point in _strip(read.latest("/world/global/path", 2))] == [0.0, 0.5, 1.0]
 
 
@@ -463,24 +431,18 @@ def test_each_frame_may_come_from_another_thread(tmp_path: Path) -> None:
         assert [(row.frame, row.stamp_ns) for row in rows[entity]] == [(k, k) for k in range(6)]
 
 
-def test_an_interrupted_run_leaves_what_was_written(tmp_path: Path) -> None:
+def test_a_file_has_its_name_when_it_is_closed_also_of_an_interrupted_run(tmp_path: Path) -> None:
     path = tmp_path / "new" / "made.rrd"
     with suppress(KeyboardInterrupt), RunRerun(path, _CAMERA) as file:
         file.add_frame(_frame(0), _made(0))
-        raise KeyboardInterrupt
-    assert len(_Read(path).rows["/overlay"]) == 1
-    assert list(path.parent.iterdir()) == [path]
-
-
-def test_a_file_has_its_name_only_when_it_is_closed_and_is_closed_once(tmp_path: Path) -> None:
-    path = tmp_path / "made.rrd"
-    with RunRerun(path, _CAMERA) as file:
-        file.add_frame(_frame(0), _made(0))
         assert not path.exists()
-        file.close()
-        size = path.stat().st_size
+        raise KeyboardInterrupt
+    size = path.stat().st_size
+    file.close()  # again: nothing
     assert path.stat().st_size == size
+    assert list(path.parent.iterdir()) == [path]
     read = _Read(path)
+    assert len(read.rows["/overlay"]) == 1
     assert (read.application, read.n_blueprints) == ("gvo", 1)
     assert rr.get_global_data_recording() is None
 
@@ -514,16 +476,13 @@ def test_a_full_disk_is_told_and_no_file_taken_for_whole(tmp_path: Path) -> None
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_exists_is_kept(tmp_path: Path) -> None:
+def test_what_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "made.rrd"
     path.write_bytes(b"mine")
     with pytest.raises(RecordingError, match="exists already"):
         RunRerun(path, _CAMERA)
     assert path.read_bytes() == b"mine"
-
-
-def test_rerun_switched_off_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RERUN", "off")
     with pytest.raises(GvoError, match="RERUN"):
-        RunRerun(tmp_path / "made.rrd", _CAMERA)
-    assert list(tmp_path.iterdir()) == []
+        RunRerun(tmp_path / "other.rrd", _CAMERA)
+    assert list(tmp_path.iterdir()) == [path]

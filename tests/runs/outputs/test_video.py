@@ -8,36 +8,19 @@ import cv2
 import numpy as np
 import pytest
 
-from gvo.config import Config
 from gvo.errors import RecordingError
-from gvo.io.frames import frames
 from gvo.io.recording import Sensor
-from gvo.io.synthetic import SyntheticRecording, WorldName
-from gvo.odometry.odometry import Odometry
+from gvo.io.synthetic import WorldName
 from gvo.runs.outputs.video import RunOverlay, film_width
-from gvo.types import FaultyFrame, Frame, FrameResult, ImageArray
+from gvo.types import FaultyFrame, ImageArray
 from gvo.viz.overlay import compose_faulty, compose_overlay
+from tests.make.tracked import N_FRAMES, Tracked, tracked
 from tests.results import loop_of
 
-_N_FRAMES = 11
-_Run = tuple[SyntheticRecording, list[tuple[Frame, FrameResult]]]
-
-
-def _track(world: WorldName, sensor: Sensor) -> _Run:
-    recording = SyntheticRecording(world, sensor, n_frames=_N_FRAMES, scale=0.5)
-    odometry = Odometry(recording.info.camera, Config())
-    seen = [f for f in frames(recording, Config()) if not isinstance(f, FaultyFrame)]
-    return recording, [(frame, odometry.track(frame)) for frame in seen]
-
 
 @pytest.fixture(scope="module")
-def drive() -> _Run:
-    return _track("driving", "stereo")
-
-
-@pytest.fixture(scope="module")
-def room() -> _Run:
-    return _track("handheld", "rgbd")
+def drive() -> Tracked:
+    return tracked("driving", "stereo")
 
 
 def _decoded(path: Path) -> Iterator[ImageArray]:
@@ -46,33 +29,32 @@ def _decoded(path: Path) -> Iterator[ImageArray]:
         yield np.asarray(answer[1], dtype=np.uint8)
 
 
-@pytest.mark.parametrize("suffix", [".webm", ".mp4"])
-@pytest.mark.parametrize("name", ["drive", "room"])
+@pytest.mark.parametrize(
+    ("world", "sensor", "name"), [("driving", "stereo", "a.mp4"), ("handheld", "rgbd", "a.webm")]
+)
 def test_a_film_shows_the_picture_of_each_frame(
-    name: str, suffix: str, request: pytest.FixtureRequest, tmp_path: Path
+    world: WorldName, sensor: Sensor, name: str, tmp_path: Path
 ) -> None:
-    recording, pairs = request.getfixturevalue(name)
-    camera = recording.info.camera
-    path = tmp_path / f"film{suffix}"
+    run, path = tracked(world, sensor), tmp_path / name
+    camera = run.recording.info.camera
     with RunOverlay(path, camera) as output:
-        for frame, result in pairs:
+        for frame, result in run.pairs():
             output.add_frame(frame, result)
         output.add_smoothed([])
     pictures = list(_decoded(path))
-    assert len(pictures) == _N_FRAMES
-    for index, ((frame, result), picture) in enumerate(zip(pairs, pictures, strict=True)):
+    assert len(pictures) == N_FRAMES
+    for index, ((frame, result), picture) in enumerate(zip(run.pairs(), pictures, strict=True)):
         width = film_width(camera)
         expected = compose_overlay(frame, result, camera, index=index, max_width=width)
         assert picture.shape == expected.shape
         assert np.abs(picture.astype(int) - expected).mean() < 8.0
-    period_ns = np.median(np.diff([frame.stamp_ns for frame, _ in pairs]))
+    period_ns = np.median(np.diff([frame.stamp_ns for frame in run.frames]))
     rate_hz = cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FPS)
     assert rate_hz == pytest.approx(1e9 / period_ns, rel=2e-3)
 
 
-def test_faulty_frames_have_dark_pictures_in_their_place(drive: _Run, tmp_path: Path) -> None:
-    recording, pairs = drive
-    camera = recording.info.camera
+def test_faulty_frames_have_dark_pictures_in_their_place(drive: Tracked, tmp_path: Path) -> None:
+    camera, pairs = drive.recording.info.camera, drive.pairs()
     faulty = FaultyFrame(stamp_ns=pairs[4][0].stamp_ns, reason="image_0/000004.png: is cut off")
     with RunOverlay(tmp_path / "film.mp4", camera) as output:
         for n, (frame, result) in enumerate(pairs):
@@ -81,20 +63,19 @@ def test_faulty_frames_have_dark_pictures_in_their_place(drive: _Run, tmp_path: 
             else:
                 output.add_frame(frame, result)
     pictures = list(_decoded(tmp_path / "film.mp4"))
-    assert len(pictures) == _N_FRAMES
+    assert len(pictures) == N_FRAMES
     expected = compose_faulty(faulty, camera, index=4, max_width=film_width(camera))
     assert np.abs(pictures[4].astype(int) - expected).mean() < 4.0
     assert pictures[4].mean() < 0.3 * pictures[5].mean()
 
 
-@pytest.mark.parametrize("n_done", [1, 7, 10])
-@pytest.mark.parametrize("suffix", [".webm", ".mp4"])
+@pytest.mark.parametrize(("suffix", "n_done"), [(".webm", 7), (".mp4", 1)])
 def test_an_interrupted_run_leaves_a_film_of_what_was_done(
-    drive: _Run, tmp_path: Path, suffix: str, n_done: int
+    drive: Tracked, tmp_path: Path, suffix: str, n_done: int
 ) -> None:
-    recording, pairs = drive
+    camera, pairs = drive.recording.info.camera, drive.pairs()
     path = tmp_path / "new" / f"film{suffix}"
-    output = RunOverlay(path, recording.info.camera)
+    output = RunOverlay(path, camera)
 
     def run() -> None:
         with output:
@@ -109,31 +90,31 @@ def test_an_interrupted_run_leaves_a_film_of_what_was_done(
     assert [entry.name for entry in path.parent.iterdir()] == [path.name]
 
 
-def test_without_a_frame_no_file_is_left(drive: _Run, tmp_path: Path) -> None:
+def test_without_a_frame_no_file_is_left(drive: Tracked, tmp_path: Path) -> None:
     for name in ("film.webm", "frames"):
-        with RunOverlay(tmp_path / name, drive[0].info.camera):
+        with RunOverlay(tmp_path / name, drive.recording.info.camera):
             pass
     assert list(tmp_path.iterdir()) == []
 
 
-def test_frames_become_numbered_files_where_a_folder_is_named(room: _Run, tmp_path: Path) -> None:
-    recording, pairs = room
-    camera = recording.info.camera
+def test_frames_become_numbered_files_where_a_folder_is_named(
+    drive: Tracked, tmp_path: Path
+) -> None:
+    camera, pairs = drive.recording.info.camera, drive.pairs()
     with RunOverlay(tmp_path / "frames", camera) as output:
         for frame, result in pairs:
             output.add_frame(frame, result)
     assert output.decisions == ()
     files = sorted((tmp_path / "frames").iterdir())
-    assert len(files) == _N_FRAMES
+    assert len(files) == N_FRAMES
     frame, result = pairs[-1]
     width = film_width(camera)
-    expected = compose_overlay(frame, result, camera, index=_N_FRAMES - 1, max_width=width)
+    expected = compose_overlay(frame, result, camera, index=N_FRAMES - 1, max_width=width)
     np.testing.assert_array_equal(cv2.imread(str(files[-1])), expected)
 
 
-def test_a_loop_is_marked_for_a_second(drive: _Run, tmp_path: Path) -> None:
-    recording, pairs = drive
-    camera = recording.info.camera
+def test_a_loop_is_marked_for_a_second(drive: Tracked, tmp_path: Path) -> None:
+    camera, pairs = drive.recording.info.camera, drive.pairs()
     loop = loop_of(pairs[2][0].stamp_ns, pairs[0][0].stamp_ns)
     ends_ns = loop.stamp_ns + 1_000_000_000
     late = [
@@ -154,12 +135,12 @@ def test_a_loop_is_marked_for_a_second(drive: _Run, tmp_path: Path) -> None:
     assert is_marked == [False, False, True, True, True, False]
 
 
-def test_what_cannot_be_written_is_told_to_the_run(drive: _Run, tmp_path: Path) -> None:
-    recording, pairs = drive
+def test_what_cannot_be_written_is_told_to_the_run(drive: Tracked, tmp_path: Path) -> None:
+    camera, pairs = drive.recording.info.camera, drive.pairs()
     folder = tmp_path / "frames"
 
     def run() -> None:
-        with RunOverlay(folder, recording.info.camera) as output:
+        with RunOverlay(folder, camera) as output:
             folder.rmdir()
             for frame, result in pairs:
                 output.add_frame(frame, result)

@@ -16,7 +16,6 @@ from gvo.types import (
     FrameLink,
     FrameResult,
     IntArray,
-    Loop,
     RelativePose,
     StereoFrame,
 )
@@ -72,17 +71,6 @@ def registration_of(n: int) -> RelativePose:
         pixels_reference=np.full((n, 2), 7.0),
         pixels_current=np.full((n, 2), 9.0),
         points_current=points,
-    )
-
-
-def loop_between(stamp_ns: int, reference_ns: int) -> Loop:
-    return Loop(
-        reference_ns=reference_ns,
-        stamp_ns=stamp_ns,
-        T_reference_frame=np.eye(4),
-        covariance=np.eye(6),
-        n_matches=60,
-        n_inliers=50,
     )
 
 

@@ -23,13 +23,13 @@ from gvo.viz.view.page import Page
 from gvo.viz.view.player import Player
 from gvo.viz.view.server import ViewServer
 from tests.recordings import Held
+from tests.results import loop_of
 from tests.viz.view.fakes import (
     CAMERA,
     PERIOD_NS,
     FakeWindow,
     cells,
     frame_of,
-    loop_between,
     pose_of,
     result_of,
 )
@@ -130,7 +130,7 @@ def test_loops_go_on_being_drawn_where_poses_are_corrected(
 ) -> None:
     for index in range(8):
         add(player, window, index)
-    add(player, window, 8, loops=(loop_between(8 * PERIOD_NS, 0),))
+    add(player, window, 8, loops=(loop_of(8 * PERIOD_NS, 0),))
     np.testing.assert_allclose(shown(player).loops[0, :, 2], [8.0, 0.0])
     add(player, window, 9)
     np.testing.assert_allclose(shown(player).loops[:, :, 0], 0.5)

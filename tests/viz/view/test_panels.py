@@ -91,16 +91,14 @@ def test_a_view_that_was_shifted_at_rest_stays_shifted(
     np.testing.assert_allclose(seen(client, 3), shifted)
 
 
-def test_who_comes_later_sees_what_the_others_see(server: FakeServer, view: ViewPoint) -> None:
+def test_who_comes_later_sees_what_the_others_see_and_what_does_not_follow_stays(
+    server: FakeServer, view: ViewPoint
+) -> None:
     first = server.connect(0)
     for index in range(1, 8):
         view.show_pose(pose_of(index))
     np.testing.assert_allclose(seen(server.connect(1), 7), seen(first, 7))
-
-
-def test_a_view_that_does_not_follow_stays(server: FakeServer, view: ViewPoint) -> None:
-    client = server.connect(0)
-    position = client.camera.position
+    position = first.camera.position
     view.follow = cast(Any, SimpleNamespace(value=False))
     view.show_pose(pose_of(9))
-    np.testing.assert_array_equal(client.camera.position, position)
+    np.testing.assert_array_equal(first.camera.position, position)

@@ -34,24 +34,17 @@ def test_closing_frees_the_port_and_ends_its_threads() -> None:
     assert [thread for thread in left if "ThreadPool" not in thread.name] == []
 
 
-def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
-    with open_server("127.0.0.1", 0, title="gvo"):
-        pass
-    assert capfd.readouterr() == ("", "")
-
-
-def test_a_taken_port_is_told_with_the_one_that_serves() -> None:
+def test_a_taken_port_is_told_with_the_one_that_serves_and_nothing_is_printed(
+    capfd: pytest.CaptureFixture[str], view: ViewServer
+) -> None:
+    assert view.note == ""
     with socket.create_server(("127.0.0.1", 0)) as holder:
         port = holder.getsockname()[1]
-        with open_server("127.0.0.1", port, title="gvo") as view:
-            assert view.viser.get_port() > port
-            assert view.note == (
-                f"port {port} of 127.0.0.1 is taken: serving on {view.viser.get_port()}"
-            )
-
-
-def test_a_free_port_needs_no_note(view: ViewServer) -> None:
-    assert view.note == ""
+        with open_server("127.0.0.1", port, title="gvo") as moved:
+            other = moved.viser.get_port()
+            assert other > port
+            assert moved.note == f"port {port} of 127.0.0.1 is taken: serving on {other}"
+    assert capfd.readouterr() == ("", "")
 
 
 def test_an_address_of_another_machine_is_refused() -> None:
@@ -77,22 +70,21 @@ def answer(port: int, origin: str | None, host: str) -> int:
         connection.close()
 
 
-def test_another_page_in_the_browser_cannot_steer(view: ViewServer) -> None:
+def test_the_page_itself_can_steer_and_another_page_in_the_browser_cannot(
+    view: ViewServer,
+) -> None:
     port = view.viser.get_port()
     here = f"127.0.0.1:{port}"
-    refused = 403
-    assert answer(port, "http://example.org", here) == refused
-    assert answer(port, f"http://localhost:{port + 1}", f"localhost:{port}") == refused
-    # a name of the net that leads to this machine
-    assert answer(port, f"http://example.org:{port}", f"example.org:{port}") == refused
-
-
-def test_the_page_itself_can_steer(view: ViewServer) -> None:
-    port = view.viser.get_port()
-    upgraded = 101
-    assert answer(port, f"http://127.0.0.1:{port}", f"127.0.0.1:{port}") == upgraded
-    assert answer(port, None, f"127.0.0.1:{port}") == upgraded
-    assert answer(port, "http://localhost:9999", "localhost:9999") == upgraded  # forwarded
+    for origin, host, status in (
+        ("http://example.org", here, 403),
+        (f"http://localhost:{port + 1}", f"localhost:{port}", 403),
+        # A name of the net that leads to this machine.
+        (f"http://example.org:{port}", f"example.org:{port}", 403),
+        (f"http://{here}", here, 101),
+        (None, here, 101),
+        ("http://localhost:9999", "localhost:9999", 101),  # forwarded
+    ):
+        assert answer(port, origin, host) == status, origin
 
 
 def test_other_names_of_the_machine_serve_the_network() -> None:
