@@ -212,7 +212,7 @@ def check_depth(samples: Sequence[Sample], config: Config) -> Iterator[Finding]:
 
 
 def _check_values(depths: Sequence[DepthArray], config: Config) -> Iterator[Finding]:
-    """Yield the findings on the depths themselves, by the typical image."""
+    """Yield the findings on the depth values: medians over the images."""
     known = [depth[np.isfinite(depth)] for depth in depths]
     median_m = _typical([float(np.nanmedian(depth)) for depth in depths])
     yield measured("depth: scale", median_m, text=f"median {median_m:.3g} m")

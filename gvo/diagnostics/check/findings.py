@@ -145,7 +145,7 @@ def _is_info(finding: Finding) -> bool:
 
 
 def _merged(findings: Iterable[Finding]) -> Iterator[Finding]:
-    """Yield the findings, those of two streams as one if both have the same, good verdict."""
+    """Yield the findings, those of two streams joined where both have the same, good verdict."""
     left = list(findings)
     while left:
         finding = left.pop(0)

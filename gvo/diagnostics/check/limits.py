@@ -73,9 +73,9 @@ RULES: Mapping[str, Rule] = {
     "period": Rule(
         low=0.5, high=10_000.0, unit="ms", fix="stamps are in a wrong unit: mend the driver"
     ),
-    # Velocities, which predict the next frame, are off by as much.
+    # The velocity that predicts the next frame is wrong by as much.
     "jitter": Rule(high=0.3, unit="%", fix="stamp at the exposure, not where messages arrive"),
-    # So long a camera is coasted over with little harm; `window.lost_after_s` is the fault.
+    # Odometry coasts over shorter gaps with little harm; `window.lost_after_s` is the fault.
     "gaps": Rule(high=0.5, unit="s", fix="find what stalled the recording: disk, bandwidth"),
     # `STAMP_DIFFERENCES_MS` has the limit of each sensor.
     "stamp difference": Rule(
@@ -85,7 +85,7 @@ RULES: Mapping[str, Rule] = {
     "clock jump": Rule(
         high=MAX_CLOCK_JUMP_MS, unit="ms", fix="a clock was set, or recording stalled"
     ),
-    # A thousandth: quartz is a hundred times better.
+    # 60 ms a minute is a thousandth; clocks of quartz are a hundred times better.
     "clock drift": Rule(
         low=-60.0, high=60.0, unit="ms/min", fix="synchronise the camera's clock (PTP, NTP)"
     ),
@@ -98,14 +98,14 @@ RULES: Mapping[str, Rule] = {
         unit="m",
         fix="P[3] of the right CameraInfo is -fx * baseline in metres",
     ),
-    # Of 0 to 255: corners outside have no contrast against the noise.
+    # Mean grey value, 0 to 255; images outside have too little contrast for corners.
     "brightness": Rule(
         low=25.0, high=230.0, unit="grey", fix="set exposure and gain, or light the scene"
     ),
     "clipped pixels": Rule(
         high=0.3, unit="%", fix="longer exposure where they are black, shorter where white"
     ),
-    # Sharp cameras have 0.3 to 1.3.
+    # Sharp images have 0.3 to 1.3 px.
     "blur": Rule(
         high=MAX_BLUR_PX, unit="px", fix="focus the lens; shorter exposure in fast motion"
     ),
@@ -156,7 +156,7 @@ RULES: Mapping[str, Rule] = {
     "levels": Rule(
         low=64.0, fault_low=16.0, fix="record 16UC1 or 32FC1: depth of 8 bits is of no use"
     ),
-    # Drivers register to two or three pixels.
+    # Good drivers register depth within two or three pixels.
     "misregistration": Rule(
         high=3.0,
         fault_high=6.0,

@@ -18,7 +18,7 @@ from gvo.io.recording import ChosenImages, Source, StampedImage
 from gvo.io.sync import Pair
 from gvo.types import FaultyFrame, Frame, IntArray
 
-# For images to look at, if none are close enough in time for odometry.
+# If no images are close enough in time for odometry, images within this limit are looked at.
 _WIDE_LIMIT_MS = 200.0
 
 
@@ -121,7 +121,7 @@ def _images_of(chosen: list[list[Pair]]) -> Iterator[StampedImage]:
 
 
 def _load(source: Source, config: Config, chosen: list[list[Pair]]) -> Iterator[Sample]:
-    # Frozen images are found by a check of their own, which needs them.
+    # The check for frozen images needs images that repeat the one before.
     sync = config.sync.model_copy(update={"repeated_images": "keep"})
     config = config.model_copy(update={"sync": sync})
     # As a recording, so that they become frames as all others.

@@ -25,11 +25,12 @@ _N_PARTS = 3
 _N_FRAMES = 30
 # Images of a stream may come so much later than those of the other.
 _DELAY_NS = 1_000_000_000
-# Largest sigma that is of use, and the difference that is one, in sigmas and at least.
+# A readout of a larger sigma is not told.
 _MAX_SIGMA_MS = 2.5
+# A given readout is wrong if it differs by more sigmas, and by more milliseconds, than these.
 _N_SIGMAS = 3.0
 _MIN_DIFFERENCE_MS = 2.0
-# Links tell the readout best, also those that would add little to the poses.
+# More links than a run makes: they tell the readout, even where they add little to the poses.
 _LINK_GAIN = 0.5
 
 

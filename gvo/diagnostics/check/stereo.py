@@ -38,7 +38,8 @@ _MAX_SIGMA = 0.03
 _SIGN_PX = 1.0
 # Row differences farther from the median are wrong matches.
 _OUTLIER_PX, _OUTLIER_SIGMAS = 3.0, 8.0
-# Another pairing is better if it reduces the spread of the rows, of a minimum size, by this factor.
+# Another pairing fits better if it reduces the spread of the rows by this factor, from a spread
+# that is not small anyway.
 _STEP_RATIO, _MIN_STEP_SPREAD_PX = 0.6, 0.5
 _MIN_STEPS = 3
 

@@ -181,7 +181,7 @@ def _follow(
     columns: tuple[FloatArray, FloatArray],
     radius: int,
 ) -> Corner:
-    """Correlate a patch with the row of its partner, at columns named by the first of both."""
+    """Correlate a patch with the row of its partner; `columns`: their names, and pixels."""
     first = _patch(images[0], pixel, radius)
     names, places = columns
     middle = (0.5 * (places[0] + places[-1]), partner[1])

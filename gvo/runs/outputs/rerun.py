@@ -291,7 +291,7 @@ class RunRerun(AbstractContextManager["RunRerun"]):
             self._log(f"world/{name}/frame", _transform(estimate.T_world_frame))
 
     def _add_points(self, image: ImageArray, seen: Scene, *, is_keyframe: bool) -> None:
-        """Log the matched points; of a keyframe its inliers in the world, too."""
+        """Log the matched points, and the inliers of a keyframe in the world."""
         points = seen.points
         found = np.where(
             points.inliers[:, np.newaxis],
@@ -446,7 +446,7 @@ def _positions(estimates: Sequence[Estimate]) -> FloatArray:
 
 
 def _dots(points: FloatArray, colours: FloatArray | ImageArray) -> rr.Points3D:
-    # No colour for no point: an empty array would be taken for one of a shape it has not.
+    # Rerun cannot tell the shape of an empty array of colours.
     kept = colours.astype(np.uint8) if len(points) > 0 else None
     return rr.Points3D(points.reshape(-1, 3), colors=kept, radii=_SMALL_DOT)
 

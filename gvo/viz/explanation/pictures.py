@@ -265,13 +265,13 @@ def _draw_candidates(explanation: FrameExplanation) -> Plot:
     share = 1.0 if is_wide(image.shape) else 0.5
     figure = new_figure(n_rows * (image_height(image.shape, share=share) + 0.6))
     parts = np.asarray(figure.subfigures(n_rows, n_columns, squeeze=False)).ravel()
-    words = []
+    words, n_legend = [], 3 if n_columns == 1 else 2
     for part, (where, background, sorting) in zip(parts, shown, strict=True):
         axes = part.subplots()
         show_image(axes, background, f"without a match {where}")
         _draw_reasons(axes, sorting)
         if axes.get_legend_handles_labels()[1]:
-            part.legend(loc="outside lower center", ncols=3, frameon=False)
+            part.legend(loc="outside lower center", ncols=n_legend, frameon=False)
         words.append(f"{where}: {count_words(sorting.counts())}")
     text = "Keypoints without a match, by the first test that all their candidates failed. "
     return _picture("3_candidates", f"{text}{'; '.join(words).capitalize()}.", figure)

@@ -32,13 +32,13 @@ FILE_NAME = "gvo.yaml"
 
 _JPEG_QUALITY = 80
 _START_SIGMAS = 10
-# Size of the drawn camera and its height above the ground, by the median depth at first.
+# Size of the drawn camera and its height above the ground, as shares of the first median depth.
 _CAMERA_SHARE = 0.15
 _GROUND_SHARE = 0.15
 _DEPTH_PER_BASELINE = 30.0
 _VIEW_SHARE = 0.5
-_PERIOD_S = 1.0 / 15.0  # at least, from drawing to drawing
-_CLOUD_PERIOD_S = 1.0  # it is large
+_PERIOD_S = 1.0 / 15.0  # shortest time between two drawings
+_CLOUD_PERIOD_S = 1.0  # and between two clouds, which are large
 
 
 def serve_player(

@@ -38,7 +38,7 @@ class Tracking:
     def peek(self) -> Frame | FaultyFrame | None:
         """Return the next frame; None at the end."""
         if self._next is None and not self.is_finished:
-            self.is_finished = True  # unless there is one
+            self.is_finished = True  # set back below where there is one
             start = time.perf_counter()
             self._next = next(self._items, None)
             self._read_ms = 1e3 * (time.perf_counter() - start)
@@ -69,7 +69,7 @@ class Tracking:
         item = self.peek()
         if item is None:
             return False
-        self.is_finished = True  # unless all goes well
+        self.is_finished = True  # set back below where all goes well
         result = None
         if not isinstance(item, FaultyFrame):
             result = self._odometry.track(item)
