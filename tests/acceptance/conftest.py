@@ -1,6 +1,7 @@
 """Scripts, run in this process."""
 
 import runpy
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +11,8 @@ from tests.conftest import Answer
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 Script = Callable[..., Answer]
+# Behind an installed gvo: the parts of the benchmark are imported by tests.
+sys.path.append(str(SCRIPTS.parent))
 
 
 @pytest.fixture

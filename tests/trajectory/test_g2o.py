@@ -133,8 +133,8 @@ def test_a_singular_information_matrix_gives_no_covariance() -> None:
     ("text", "words"),
     [
         ("VERTEX_SE3:QUAT 0 1 2 3 0 0 0", "needs 8 numbers, got 7"),
-        ("VERTEX_SE3:QUAT 0.5 1 2 3 0 0 0 1", "no whole number"),
-        ("VERTEX_SE3:QUAT 1_0 1 2 3 0 0 0 1", "no whole number"),
+        ("VERTEX_SE3:QUAT 0.5 1 2 3 0 0 0 1", "not a whole number"),
+        ("VERTEX_SE3:QUAT 1_0 1 2 3 0 0 0 1", "not a whole number"),
         ("VERTEX_SE3:QUAT 0 1 2 3_0 0 0 0 1", "'3_0' is no decimal number"),
         ("VERTEX_SE3:QUAT 0 1 2 x 0 0 0 1", "x"),
         ("VERTEX_SE3:QUAT 0 1 2 3 0 0 0 2", "length 2"),

@@ -28,7 +28,7 @@ def test_a_line_is_broken_where_a_step_is_long(n: int, at: int) -> None:
     seconds = np.arange(float(n))
     seconds[at:] += 1000.0
     points = broken(seconds, np.column_stack([seconds, seconds]))
-    if n > 2:  # of two poses, the step between them is the usual one
+    if n > 3:  # of fewer poses, the long step is among the usual ones
         assert gaps_before(seconds).tolist() == [at]
         assert np.flatnonzero(np.isnan(points[:, 0])).tolist() == [at]
 
