@@ -68,6 +68,7 @@ _FIXED: Mapping[str, Value] = {
     "check.min_depth_median_m": 0.2,
     "check.min_followed_share": 0.3,
     "check.min_stereo_matches": 60,
+    "check.n_samples": 12,
     "depth.icp": "auto",
     "depth.virtual_baseline_m": 0.075,
     "klt.cell_size_px": 40,
@@ -325,12 +326,6 @@ class RuntimeConfig(Section):
     )
 
 
-class CheckConfig(Section):
-    """Samples of `gvo check`."""
-
-    n_samples: int = _expert(12, "frames sampled, each with its successor", ge=2, le=1000)
-
-
 class Config(Section):
     """The whole configuration."""
 
@@ -348,7 +343,6 @@ class Config(Section):
     window: WindowConfig = WindowConfig()
     loops: LoopsConfig = LoopsConfig()
     runtime: RuntimeConfig = RuntimeConfig()
-    check: CheckConfig = CheckConfig()
 
 
 def load_configuration(path: Path | None = None, settings: Sequence[str] = ()) -> Config:
@@ -431,8 +425,11 @@ def _explain(error: ValidationError) -> str:
     name = cut(".".join(str(part) for part in first["loc"]), MAX_SHOWN)
     if first["type"] != "extra_forbidden":
         return f"{name}={shortened(first['input'])}: {first['msg'].lower()}; see `gvo config --all`"
-    if name in _FIXED:
-        return f"{name} is no parameter any more: it is fixed at {_yaml(_FIXED[name])}"
+    gone = name
+    if isinstance(first["input"], Mapping):  # a whole section
+        gone = ".".join([name, *map(str, first["input"])][:2])
+    if gone in _FIXED:
+        return f"{gone} is no parameter any more: it is fixed at {_yaml(_FIXED[gone])}"
     known = list(values_by_name(Config()) if "." in name else sections())
     nearest = difflib.get_close_matches(name, known, n=1, cutoff=0.0)[0]
     return f"unknown key {name}: did you mean {nearest}? `gvo config --all` lists all"

@@ -166,7 +166,12 @@ def test_an_unreadable_file_is_refused_by_name(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("klt.max_return_px", "0.5"), ("window.kernel_threshold", "null"), ("depth.icp", "auto")],
+    [
+        ("klt.max_return_px", "0.5"),
+        ("window.kernel_threshold", "null"),
+        ("depth.icp", "auto"),
+        ("check.n_samples", "12"),
+    ],
 )
 def test_a_parameter_that_has_gone_is_refused_with_its_fixed_value(key: str, value: str) -> None:
     message = refusal(None, (f"{key}=1",))

@@ -23,12 +23,15 @@ from gvo.io.poses.tf import TfBuffer
 from gvo.io.recording import RecordingInfo, Source
 from gvo.types import Failure
 
+# Frames that are decoded, each with its successor: a check takes seconds, whatever the length.
+_N_SAMPLES = 12
+
 
 def check_recording(
     source: Source,
     config: Config | None = None,
     *,
-    n_samples: int | None = None,
+    n_samples: int = _N_SAMPLES,
     transforms: TfBuffer | None = None,
     base_frame: str = "base_link",
 ) -> CheckResult:
@@ -43,8 +46,8 @@ def check_recording(
         The recording.
     config : Config, optional
         As for odometry.
-    n_samples : int, optional
-        Number of decoded frames, each with the next one; default: `check.n_samples`.
+    n_samples : int
+        Number of decoded frames, each with the next one.
     transforms : TfBuffer, optional
         Transforms of the same bag; if None, the tree of frames is not checked.
     base_frame : str
@@ -63,7 +66,7 @@ def check_recording(
     True
     """
     config = config or Config()
-    found = survey(source, config, n_samples=n_samples or config.check.n_samples)
+    found = survey(source, config, n_samples=n_samples)
     info, stamps_ns = source.info, found.stamps_ns[0]
     camera = _find_camera(info)
     findings = [
