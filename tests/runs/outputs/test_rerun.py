@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-import pyarrow as pa  # type: ignore[import-untyped]
 import pytest
 from scipy.spatial.transform import Rotation
 
 pytest.importorskip("rerun")
+import pyarrow as pa  # type: ignore[import-untyped]
 import rerun as rr
 from rerun.chunk import RrdReader
 
