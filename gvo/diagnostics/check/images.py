@@ -13,9 +13,8 @@ from gvo.config import Config
 from gvo.diagnostics.check.findings import Finding
 from gvo.diagnostics.check.limits import MAX_BLUR_PX, lost, measured, unknown
 from gvo.diagnostics.check.sampling import Sample
-from gvo.frontend.tracking import N_WIDE_LEVELS, detect_corners, track_pixels
+from gvo.frontend.tracking import detect_corners
 from gvo.types import (
-    BoolArray,
     DepthArray,
     FaultyFrame,
     FloatArray,
@@ -81,15 +80,6 @@ def _grey_images(frame: Frame | FaultyFrame | None) -> tuple[ImageArray, ...]:
     if isinstance(frame, StereoFrame):
         return (frame.left, frame.right)
     return (frame.image,) if isinstance(frame, RgbdFrame) else ()
-
-
-def follow_corners(
-    images: tuple[ImageArray, ImageArray], n_corners: int
-) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return corners of an image, where they are in the next one, and which are found there."""
-    corners = detect_corners(images[0], n_corners)
-    ends, is_found = track_pixels(images, corners, corners, n_levels=N_WIDE_LEVELS, is_checked=True)
-    return corners, ends, is_found
 
 
 def blur_sigma_px(image: ImageArray) -> float:

@@ -11,10 +11,10 @@ import numpy as np
 
 from gvo.config import Config
 from gvo.diagnostics.check.findings import Finding
-from gvo.diagnostics.check.images import follow_corners
 from gvo.diagnostics.check.sampling import Sample, Survey
 from gvo.errors import GvoError
 from gvo.frontend.klt import image_of
+from gvo.frontend.tracking import N_WIDE_LEVELS, detect_corners, track_pixels
 from gvo.io.frames import frames
 from gvo.io.recording import ChosenImages, Source, StampedImage
 from gvo.odometry.odometry import Odometry
@@ -86,7 +86,8 @@ def _flow_px(sample: Sample, config: Config) -> float:
     if second is None or isinstance(first, FaultyFrame) or isinstance(second, FaultyFrame):
         return 0.0
     images = image_of(first), image_of(second)
-    corners, ends, is_found = follow_corners(images, config.klt.n_corners)
+    corners = detect_corners(images[0], config.klt.n_corners)
+    ends, is_found = track_pixels(images, corners, corners, n_levels=N_WIDE_LEVELS, is_checked=True)
     lengths = np.linalg.norm(ends - corners, axis=1)[is_found]
     return float(np.median(lengths)) if len(lengths) >= config.ransac.min_inliers else 0.0
 
