@@ -6,8 +6,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from urllib.parse import urlsplit
-from urllib.request import url2pathname
 
 from gvo._text import cut, shortened_words
 
@@ -115,7 +113,10 @@ def missing_extra(what: str, extra: str) -> ConfigurationError:
 
 def _origin() -> str:
     """Return what pip is to be given: the folder or file that gvo was installed from."""
+    # Loaded here: they take longer to import than all else of this module.
     from importlib.metadata import PackageNotFoundError, distribution
+    from urllib.parse import urlsplit
+    from urllib.request import url2pathname
 
     clone = Path(__file__).parents[1]
     if (clone / "pyproject.toml").is_file():

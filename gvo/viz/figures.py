@@ -127,9 +127,11 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 
 def _write(figure: Figure, to: Path | io.BytesIO, suffix: str, **options: Any) -> None:  # noqa: ANN401
+    if (engine := figure.get_layout_engine()) is not None:
+        # Once: laid out again it would differ a little, and with an engine savefig draws twice.
+        engine.execute(figure)
+        figure.set_layout_engine(None)
     figure.savefig(to, format=suffix[1:], metadata=_METADATA[suffix], **options)
-    # Laid out again it would differ a little.
-    figure.set_layout_engine("none")
 
 
 def write_plots(plots: Sequence[Plot], folder: Path) -> list[Path]:

@@ -61,7 +61,6 @@ def figure_of_positions(estimates: Mapping[str, Trajectory]) -> Figure:
     for letter, panel in zip("xyz", panels, strict=True):
         panel.set_ylabel(f"{letter} [m]")
         panel.tick_params(labelbottom=letter == "z")
-    figure.align_ylabels(panels)
     panels[-1].set_xlabel(_stamp_label(start))
     figures.legend_below(figure, view)
     return figure

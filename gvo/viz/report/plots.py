@@ -133,7 +133,6 @@ def _curves(
         axes.margins(x=0.01)
     rows[-1].set_xlabel(label)
     legend_above(figure, rows[0])
-    figure.align_ylabels(list(rows))
     return figure
 
 
@@ -210,7 +209,6 @@ def _bands(item: Consistency, first_ns: int) -> Figure:
     for panel in panels[-1]:
         panel.set_xlabel("elapsed [s]")
     legend_above(figure, panels[0, 0])
-    figure.align_ylabels()
     return figure
 
 
