@@ -185,7 +185,7 @@ def _read(page: str) -> Iterator[NamedFault]:
     """Yield the rows of the page's tables."""
     listed = page.partition("the run does not tell:")[2].split(".")[0]
     silent = re.findall(r"`([\w-]+)`", listed)
-    for section in page.partition("\n### The faults\n")[2].split("\n#### ")[1:]:
+    for section in page.partition("\n## The faults\n")[2].split("\n### ")[1:]:
         group = re.split("[:\n]", section)[0]
         row = r"^\| `([\w-]+)`(?: \((.+?)\))? \|.*\| (\d) \| (?:`(.+)`|no) \|$"
         for name, sensor, exit_code, found_by in re.findall(row, section, re.MULTILINE):
