@@ -15,16 +15,7 @@ from gvo.backend.window import Keeping, SlidingWindow
 from gvo.config import Config
 from gvo.errors import GvoError, OutputError, RecordingError, SmoothingError, TrajectoryError
 from gvo.io.edges.events import EdgeSource, Event, InputFaults, PoseEvent
-from gvo.io.edges.lines import (
-    CSV_HEADER,
-    LineFormat,
-    Request,
-    detect_format,
-    format_error,
-    format_estimate,
-    is_header,
-    parse_line,
-)
+from gvo.io.edges.lines import Request, format_error, format_estimate, parse_line
 from gvo.io.edges.pose_graph import GRAPH, PoseGraphSource, write_graph
 from gvo.io.run_folder.writer import PICTURE, TRAJECTORIES, RunFolder, written_alone
 from gvo.odometry.chain import EdgeChain
@@ -558,7 +549,7 @@ def smooth_lines(
     Parameters
     ----------
     lines : iterable of str
-        CSV or JSON, recognised by the first line; see `gvo.io.edges.lines`.
+        Of JSON; see `gvo.io.edges.lines`.
     answer : callable
         Gets the answer to each line that is not empty, without line end: the estimate of the
         line's pose, or `{"error": ...}`.
@@ -602,17 +593,11 @@ def smooth_lines(
 def _answer_all(
     lines: Iterable[str], answer: Callable[[str], None], smoother: Smoother, faults: InputFaults
 ) -> None:
-    line_format: LineFormat | None = None
     for number, line in enumerate(lines, start=1):
         if not line.strip():
             continue
-        if line_format is None:
-            line_format = detect_format(line)
-            if line_format == "csv" and is_header(line):
-                answer(CSV_HEADER)
-                continue
         try:
-            reply = _reply(parse_line(line, line_format), smoother, line_format)
+            reply = _reply(parse_line(line), smoother)
         except ValueError as error:
             faults.add("lines were not understood", f"line {number}: {error}")
             reply = format_error(f"line {number}: {error}")
@@ -623,7 +608,7 @@ def _answer_all(
         answer(reply)
 
 
-def _reply(request: Request, smoother: Smoother, line_format: LineFormat) -> str:
+def _reply(request: Request, smoother: Smoother) -> str:
     frame_id = request.frame_id
     if frame_id not in smoother.window:
         estimate, rejected = _add(request, smoother), list[Rejected]()
@@ -631,7 +616,7 @@ def _reply(request: Request, smoother: Smoother, line_format: LineFormat) -> str
         estimate, rejected = _extend(request, smoother)
     if request.keep is not None and frame_id in smoother.window:
         (smoother.window.keep if request.keep else smoother.window.release)(frame_id)
-    return format_estimate(estimate, line_format, rejected)
+    return format_estimate(estimate, rejected)
 
 
 def _add(request: Request, smoother: Smoother) -> Estimate:

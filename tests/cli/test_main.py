@@ -331,23 +331,27 @@ def test_smooth_tells_what_a_pose_graph_began_at(command: Command, tmp_path: Pat
     assert (tmp_path / "out/smoothed.g2o").read_text().splitlines()[-1] == edge.strip()
 
 
+FIRST_LINE = '{"id": "a", "stamp_ns": 0}'
+SECOND_LINE = '{"id": "b", "stamp_ns": 100000000, "reference": "a", "pose": [0, 0, 1, 0, 0, 0, 1]}'
+
+
 def test_smooth_answers_a_pipe_line_by_line_at_once(tmp_path: Path) -> None:
     process = start("smooth", "-", "--out", tmp_path)
     assert process.stdin is not None
     assert process.stdout is not None
     answers = []
-    lines = ["a,0", "b,100000000,a,0,0,1,0,0,0,1", "nonsense", "c,200000000,b,0,0,1,0,0,0,1"]
-    for line in lines:
+    for line in (FIRST_LINE, SECOND_LINE, "nonsense", FIRST_LINE):
         # an answer must come before the next line is sent
         process.stdin.write(f"{line}\n")
         answers.append(process.stdout.readline())
     rest, errors = process.communicate(timeout=60)
-    assert [answer.split(",")[0] for answer in answers if answer[0] != "{"] == ["a", "b", "c"]
-    assert json.loads(answers[2])["error"].startswith("line 3:")
+    replies = [json.loads(answer) for answer in answers]
+    assert [reply.get("id") for reply in replies] == ["a", "b", None, "a"]
+    assert replies[2]["error"].startswith("line 3:")
     assert rest == ""
     assert process.returncode == 3
-    assert "3 poses, 2 edges" in errors
-    assert len(gvo.read_trajectory(tmp_path / "smoothed.txt")) == 3
+    assert "2 poses, 1 edges" in errors
+    assert len(gvo.read_trajectory(tmp_path / "smoothed.txt")) == 2
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -357,7 +361,7 @@ def test_a_signal_ends_a_waiting_pipe_with_complete_files(
     process = start("smooth", "-", "--out", tmp_path)
     assert process.stdin is not None
     assert process.stdout is not None
-    for line in ("a,0", "b,100000000,a,0,0,1,0,0,0,1"):
+    for line in (FIRST_LINE, SECOND_LINE):
         process.stdin.write(f"{line}\n")
         process.stdout.readline()
     process.send_signal(number)

@@ -9,7 +9,7 @@ import numpy as np
 from gvo.config import Config
 from gvo.errors import GvoError
 from gvo.io.edges.events import InputFaults
-from gvo.io.edges.lines import detect_format, parse_line
+from gvo.io.edges.lines import parse_line
 from gvo.io.edges.opening import open_edges, parse_sigma
 from gvo.io.edges.pose_graph import PoseGraphSource
 from gvo.io.opening import open_recording
@@ -39,11 +39,6 @@ _GRAPH = (
     b"EDGE3 1 2 1 0 0 0 0 0.1\nVERTEX3 2 1 1 1 0 0 0\nEDGE_SE3:QUAT 2 0 1 0 0 0 0 0 1 "
     + _UPPER
     + b"\n"
-)
-_CSV = (
-    b"id,stamp_ns\na,0\nb,100000000,a,0,0,1,0,0,0,1\nb,,a,0,0,1,0,0,0,1,.1,.1,.1,.1,.1,.1\n"
-    b"c,200000000,,1,2,3,.1,.1,.1\nkeep,b\nd,300000000,c,0,0,1,0,0,0,1,"
-    + _UPPER.replace(b" ", b",")
 )
 _JSON = b"""{"id": 0, "stamp_ns": 0}
 {"id": 1, "stamp_ns": 100, "reference": 0, "pose": [0, 0, 1, 0, 0, 0, 1]}
@@ -109,7 +104,7 @@ def _edge_files(data: bytes) -> None:
 def _edge_line(data: bytes) -> None:
     line = data.decode(errors="replace")
     if line.strip():
-        parse_line(line, detect_format(line))
+        parse_line(line)
 
 
 def _smoothed_lines(data: bytes) -> None:
@@ -230,10 +225,10 @@ TARGETS = (
     _text(
         name="edge_lines",
         run=_edge_line,
-        seeds=lambda: _lines_of(_CSV, _JSON),
+        seeds=lambda: _lines_of(_JSON),
         documented=(ValueError,),
     ),
-    _text(name="smoothed_lines", run=_smoothed_lines, seeds=lambda: [_CSV, _JSON]),
+    _text(name="smoothed_lines", run=_smoothed_lines, seeds=lambda: [_JSON]),
     _text(
         name="words",
         run=_words,

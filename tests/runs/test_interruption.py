@@ -196,7 +196,9 @@ def smooth_file(folder: Path, out: Path) -> None:
 
 
 def smooth_stream(folder: Path, out: Path) -> None:
-    smooth_lines((f"{k},{k}000000000" for k in range(20)), lambda line: None, out)
+    smooth_lines(
+        (f'{{"id": {k}, "stamp_ns": {k}000000000}}' for k in range(20)), lambda line: None, out
+    )
 
 
 @pytest.mark.parametrize("smooth", [smooth_file, smooth_stream])

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 import gvo
 from gvo.errors import RecordingError
-from gvo.io.edges.lines import CSV_HEADER
 from gvo.runs.run import RunResult
 from gvo.runs.smooth import smooth_lines
 
@@ -39,14 +38,6 @@ def test_each_line_is_answered_by_the_causal_estimate(tmp_path: Path) -> None:
         assert reply["status"] == "ok"
         assert reply["rejected"] == []
     assert len(gvo.read_trajectory(tmp_path / "smoothed.txt")) == 9
-
-
-def test_csv_is_answered_in_csv_with_a_header_where_there_is_one(tmp_path: Path) -> None:
-    lines = ["id,stamp_ns,reference", "a,0", "", "b,100000000,a,0,0,1,0,0,0,1"]
-    result, answers = run(lines, tmp_path)
-    assert answers[0] == CSV_HEADER
-    assert [answer.split(",")[0] for answer in answers[1:]] == ["a", "b"]
-    assert result.is_complete
 
 
 def test_a_malformed_line_is_answered_and_the_stream_goes_on(tmp_path: Path) -> None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,9 +16,9 @@ from gvo.io.bag.messages import bare, stamp_of, transform_of
 from gvo.io.bag.reader import BagReader, MessageReader
 from gvo.io.bag.topics import Topic, describe_topics, find_topic
 from gvo.io.edges.events import InputFaults
-from gvo.io.edges.pose_streams import PoseSample
-from gvo.trajectory.trajectory import StampsFrom
-from gvo.types import Failure, FloatArray, IntArray
+from gvo.io.edges.pose_streams import PoseStream
+from gvo.trajectory.trajectory import Trajectory
+from gvo.types import Failure, FloatArray
 
 _TRANSFORM_TYPE = "geometry_msgs/msg/TransformStamped"
 _COVARIANCE_TYPES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseWithCovarianceStamped")
@@ -31,12 +31,40 @@ POSITION_TYPES = (FIX_TYPE, "geometry_msgs/msg/PointStamped")
 """Message types that hold a position of a stamp."""
 
 
-def open_streams(path: Path, names: Sequence[str]) -> list[TopicStream]:
-    """Return the streams of a bag's topics of poses; without names, of the only one there is."""
+def read_streams(path: Path, names: Sequence[str], faults: InputFaults) -> list[PoseStream]:
+    """Read a bag's topics of poses; without names, the only one there is."""
     reader = BagReader(path)
-    streams = [TopicStream(reader, topic) for topic in find_topics(reader, names, str(path))]
-    streams[0].decisions[:0] = reader.notes
-    return streams
+    topics = find_topics(reader, names, str(path))
+    streams = [_read_stream(reader, topic, faults) for topic in topics]
+    decision = "; ".join([*reader.notes, streams[0].decision])
+    return [replace(streams[0], decision=decision), *streams[1:]]
+
+
+def _read_stream(reader: BagReader, topic: Topic, faults: InputFaults) -> PoseStream:
+    poses: list[PoseMessage] = []
+    broken_off = ""
+    try:
+        for pose in pose_messages(reader, topic, faults):
+            if poses and pose.stamp_ns <= poses[-1].stamp_ns:
+                first = f"{pose.stamp_ns} ns after {poses[-1].stamp_ns} ns in {topic.name}"
+                faults.add("poses have a stamp that does not advance and were skipped", first)
+                continue
+            poses.append(pose)
+    except RecordingError as error:
+        broken_off = str(error)
+    unknown = np.full((6, 6), np.nan)
+    covariances = [unknown if one.covariance is None else one.covariance for one in poses]
+    return PoseStream(
+        name=topic.name,
+        poses=Trajectory(
+            stamps_ns=np.array([pose.stamp_ns for pose in poses], dtype=np.int64),
+            T_world_frame=np.reshape([pose.T_parent_child for pose in poses], (-1, 4, 4)),
+            stamps_from="topic",
+        ),
+        covariances=np.reshape(covariances, (-1, 6, 6)),
+        decision=f"{topic.name}: {topic.type}, {topic.n_messages} messages",
+        broken_off=broken_off,
+    )
 
 
 def find_topics(
@@ -64,71 +92,56 @@ def _find(name: str, topics: Sequence[Topic], where: str) -> Topic:
     return topic
 
 
-class TopicStream:
-    """The poses of one topic of a bag.
+class PoseMessage(NamedTuple):
+    """A pose of a topic: T_parent_child (4, 4) in metres; its covariance (6, 6), if stated."""
 
-    Attributes
-    ----------
-    parent_frame, child_frame : str
-        As the first pose names them, without a leading slash: T_parent_child is the pose. Empty
-        before it is read; the child also where the type names none.
+    stamp_ns: int
+    T_parent_child: FloatArray
+    covariance: FloatArray | None
+    child_frame: str
+
+
+def pose_messages(
+    reader: MessageReader, topic: Topic, faults: InputFaults
+) -> Iterator[PoseMessage]:
+    """Yield the poses of a topic in the order of recording.
+
+    Messages that hold none, or are of other frames than the first, are skipped and counted.
     """
-
-    def __init__(self, reader: MessageReader, topic: Topic) -> None:
-        self._reader, self._topic = reader, topic
-        self.name = topic.name
-        self.decisions = [f"{topic.name}: {topic.type}, {topic.n_messages} messages"]
-        self.n_poses = topic.n_messages
-        self.stamps_from: StampsFrom = "topic"
-        self.parent_frame = ""
-        self.child_frame = ""
-        self._has_frames = False
-
-    def samples(self, faults: InputFaults) -> Iterator[PoseSample]:
-        """Yield the poses in the order of recording; skip and count what holds none."""
-        n_messages = 0
-        for message in self._reader.messages([self._topic.name]):
-            if message.topic.type != self._topic.type:
-                continue
-            n_messages += 1
-            try:
-                content = message.decode()
-                sample = _sample(content, self._topic)
-            except RecordingError as error:
-                faults.add("messages hold no pose and were skipped", str(error))
-                continue
-            if self._is_of_the_frames(content, faults):
-                yield sample
-        if n_messages == 0:
-            raise RecordingError(
-                f"{self._topic.name} announces {self._topic.n_messages} messages but yields "
-                "none; record or convert the bag anew"
-            )
-
-    def _is_of_the_frames(self, message: Any, faults: InputFaults) -> bool:  # noqa: ANN401
-        names = (message.header.frame_id, getattr(message, "child_frame_id", ""))
-        parent, child = map(bare, names)
-        if not self._has_frames:
-            self.parent_frame, self.child_frame, self._has_frames = parent, child, True
-        is_same = (parent, child) == (self.parent_frame, self.child_frame)
-        if not is_same:
-            reason = f"{child} in {parent} in place of {self.child_frame} in {self.parent_frame}"
+    n_messages = 0
+    first: tuple[str, str] | None = None
+    for message in reader.messages([topic.name]):
+        if message.topic.type != topic.type:
+            continue
+        n_messages += 1
+        try:
+            content = message.decode()
+            pose = _pose(content, topic)
+        except RecordingError as error:
+            faults.add("messages hold no pose and were skipped", str(error))
+            continue
+        frames = pose.child_frame, bare(content.header.frame_id)
+        first = first or frames
+        if frames == first:
+            yield pose
+        else:
+            reason = "{} in {} in place of {} in {}".format(*frames, *first)
             faults.add("messages are of other frames and were skipped", reason)
-        return is_same
+    if n_messages == 0:
+        raise RecordingError(
+            f"{topic.name} announces {topic.n_messages} messages but yields none; record or "
+            "convert the bag anew"
+        )
 
 
-def _sample(message: Any, topic: Topic) -> PoseSample:  # noqa: ANN401 - made at run time
+def _pose(message: Any, topic: Topic) -> PoseMessage:  # noqa: ANN401 - made at run time
     stamp_ns = stamp_of(message.header)
-    has_covariance = topic.type in _COVARIANCE_TYPES
-    position, orientation = _parts(message, topic.type)
-    T = transform_of(position, orientation)
+    T = transform_of(*_parts(message, topic.type))
     if isinstance(T, Failure):
         raise RecordingError(f"{topic.name} at {stamp_ns} ns: not a pose: {T.reason}")
-    return PoseSample(
-        stamp_ns=stamp_ns,
-        T_world_frame=T,
-        covariance=_covariance(message.pose.covariance, T[:3, :3]) if has_covariance else None,
-    )
+    has_covariance = topic.type in _COVARIANCE_TYPES
+    covariance = _covariance(message.pose.covariance, T[:3, :3]) if has_covariance else None
+    return PoseMessage(stamp_ns, T, covariance, bare(getattr(message, "child_frame_id", "")))
 
 
 def _parts(message: Any, type_: str) -> tuple[Any, Any]:  # noqa: ANN401 - made at run time
@@ -147,25 +160,10 @@ def _covariance(numbers: FloatArray, R: FloatArray) -> FloatArray | None:
     return np.asarray(0.5 * (covariance + covariance.T))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Positions:
-    """The positions of one topic.
+class Positions(NamedTuple):
+    """Positions of a named frame; `origin` says in words what they are relative to, if chosen."""
 
-    Parameters
-    ----------
-    stamps_ns : ndarray of int64, shape (n,)
-        Strictly increasing, nanoseconds.
-    positions : ndarray of float64, shape (n, 3)
-        In the parent frame, metres.
-    parent_frame, child_frame : str
-        Empty where the messages name none.
-    origin : str
-        Of the parent frame, where it was chosen here: the first fix, in words.
-    """
-
-    stamps_ns: IntArray
-    positions: FloatArray
-    parent_frame: str
+    trajectory: Trajectory
     child_frame: str
     origin: str = ""
 
@@ -177,32 +175,31 @@ def read_positions(reader: MessageReader, topic: Topic, faults: InputFaults) -> 
     below zero or an impossible place are skipped.
     """
     rows: dict[int, FloatArray] = {}
-    frame: str | None = None
+    frame = ""
     for message in reader.messages([topic.name]):
         if message.topic.type != topic.type:
             continue
         try:
             content = message.decode()
-            rows[stamp_of(content.header)] = _numbers(content, topic)
+            numbers = _numbers(content, topic)
         except RecordingError as error:
             faults.add("messages hold no position and were skipped", str(error))
             continue
-        if frame is None:  # the first one's counts: neither fixes nor points change theirs
+        if not rows:  # the first one's counts: neither fixes nor points change theirs
             frame = bare(content.header.frame_id)
-    if frame is None:
+        rows[stamp_of(content.header)] = numbers
+    if not rows:
         reason = "; ".join(faults.warnings()) or f"none of {topic.n_messages} messages is there"
         raise RecordingError(f"{topic.name}: holds no position: {reason}")
     stamps_ns = np.array(sorted(rows), dtype=np.int64)
-    numbers = np.stack([rows[int(stamp_ns)] for stamp_ns in stamps_ns])
+    places = np.stack([rows[int(stamp_ns)] for stamp_ns in stamps_ns])
     if topic.type != FIX_TYPE:
-        return Positions(stamps_ns=stamps_ns, positions=numbers, parent_frame=frame, child_frame="")
-    latitude, longitude, height = numbers[0]
+        return Positions(Trajectory.of_positions(stamps_ns, places, stamps_from="topic"), "")
+    latitude, longitude, height = places[0]
     return Positions(
-        stamps_ns=stamps_ns,
-        positions=local_enu(*numbers.T),
-        parent_frame="",
-        child_frame=frame,
-        origin=f"east, north, up of {latitude:.7f} deg, {longitude:.7f} deg, {height:.2f} m",
+        Trajectory.of_positions(stamps_ns, local_enu(*places.T), stamps_from="topic"),
+        frame,
+        f"east, north, up of {latitude:.7f} deg, {longitude:.7f} deg, {height:.2f} m",
     )
 
 

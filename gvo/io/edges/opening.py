@@ -9,10 +9,10 @@ import numpy as np
 
 from gvo._text import access_fault, plain_number, text_lines
 from gvo.errors import ConfigurationError, TrajectoryError
-from gvo.io.bag.poses import open_streams
-from gvo.io.edges.events import EdgeSource
+from gvo.io.bag.poses import read_streams
+from gvo.io.edges.events import EdgeSource, InputFaults
 from gvo.io.edges.pose_graph import PoseGraphSource
-from gvo.io.edges.pose_streams import FusedChains, PoseStream, StepSigma, TrajectoryStream
+from gvo.io.edges.pose_streams import FusedChains, PoseStream, StepSigma, read_stream
 from gvo.io.opening import BAG_SUFFIXES
 
 _KINDS = "expected a pose graph of g2o, poses (TUM, KITTI, EuRoC), or a bag with topics of poses"
@@ -56,9 +56,10 @@ def open_edges(
     if graphs:
         return _open_graph(inputs, graphs[0], sigmas)
     streams: list[PoseStream] = []
+    faults = InputFaults()
     for path in inputs:
-        streams += open_streams(path, topics) if path in bags else [TrajectoryStream(path=path)]
-    return FusedChains(streams, _spread(sigmas, streams))
+        streams += read_streams(path, topics, faults) if path in bags else [read_stream(path)]
+    return FusedChains(streams, _spread(sigmas, streams), faults)
 
 
 def parse_sigma(text: str) -> StepSigma:

@@ -87,15 +87,16 @@ class PoseGraphSource:
         TrajectoryError
             Naming the line that is malformed.
         """
-        held = {self._start_id, *self._fixed_ids}
-        graph = _Connector({name: T for name, T in self.vertices.items() if name in held})
-        yield graph.start(self._start_id)
+        fixed = {name: T for name, T in self.vertices.items() if name in self._fixed_ids}
+        fixed[self._start_id] = self.vertices.get(self._start_id, np.eye(4))
+        graph = _Connector(fixed)
+        yield graph.pose(self._start_id)
         for edge in self._edges:
             yield from graph.take(edge)
         yield from graph.flush()
         if self._fault:
             raise TrajectoryError(self._fault)
-        self._report_unconnected(graph)
+        self._report_unconnected(graph.known)
 
     def _read(self, path: Path) -> None:
         """Read the file up to its end, or to a line that is malformed."""
@@ -137,18 +138,19 @@ class PoseGraphSource:
                 )
             self.faults.add("lines are of tags that are not read", f"{tag} in line {number}")
 
-    def _report_unconnected(self, graph: _Connector) -> None:
-        if graph.n_waiting:
+    def _report_unconnected(self, known: set[int]) -> None:
+        apart = [edge for edge in self._edges if edge.frame_id not in known]
+        if apart:
             self.faults.add(
                 "edges are not connected with the first pose and were left out",
-                graph.first_waiting(),
-                n=graph.n_waiting,
+                f"{apart[0].reference_id} {apart[0].frame_id}",
+                n=len(apart),
             )
-        n_missing = self.n_poses - len(graph.known)
+        n_missing = self.n_poses - len(known)
         if n_missing > 0:
             self.faults.add(
                 "vertices have no edge that connects them with the first pose",
-                f"{len(graph.known)} of {self.n_poses} are connected",
+                f"{len(known)} of {self.n_poses} are connected",
                 n=n_missing,
             )
 
@@ -162,80 +164,58 @@ def _texts(path: Path) -> Iterator[tuple[int, str]]:
 
 
 class _Connector:
-    """Turns measurements into events: what is known, what waits."""
+    """Turns edges into events, one by one: those between two unknown poses wait."""
 
     def __init__(self, fixed: dict[int, FloatArray]) -> None:
         self._fixed = fixed
         self.known: set[int] = set()
         self._stamps_ns = count(0, _SECOND_NS)
+        # A new pose and the edges that come with it, until a line is of something else.
         self._pending: tuple[int, list[g2o.Measurement]] | None = None
-        # By either end, measurements by their number.
-        self._waiting: dict[int, dict[int, g2o.Measurement]] = {}
-        self._numbers = count()
-
-    @property
-    def n_waiting(self) -> int:
-        return len({number for group in self._waiting.values() for number in group})
-
-    def first_waiting(self) -> str:
-        numbered = {n: m for group in self._waiting.values() for n, m in group.items()}
-        first = numbered[min(numbered)]
-        return f"{first.reference_id} {first.frame_id}"
-
-    def start(self, frame_id: int) -> PoseEvent:
-        self.known.add(frame_id)
-        return PoseEvent(
-            frame_id=frame_id,
-            stamp_ns=next(self._stamps_ns),
-            prior=anchor(self._fixed.get(frame_id, np.eye(4))),
-        )
+        self._waiting: dict[int, list[g2o.Measurement]] = {}  # by either end
 
     def take(self, line: g2o.Measurement) -> Iterator[Event]:
-        ends = (line.reference_id, line.frame_id)
+        ends = {line.reference_id, line.frame_id}
         if self._pending is not None:
             frame_id, lines = self._pending
-            others = [end for end in ends if end != frame_id]
-            if len(others) == 1 and others[0] in self.known:
+            if frame_id in ends and len(ends) == 2 and ends - {frame_id} <= self.known:
                 lines.append(line)
                 return
         yield from self.flush()
-        unknown = [end for end in ends if end not in self.known]
+        unknown = ends - self.known
         if not unknown:
             yield EdgeEvent(frame_id=line.frame_id, edge=_edge(line))
-        elif len(unknown) == 1:
-            self._pending = (unknown[0], [line])
+        elif len(unknown) == 1 and len(ends) == 2:
+            self._pending = (unknown.pop(), [line])
         else:
-            number = next(self._numbers)
             for end in ends:
-                self._waiting.setdefault(end, {})[number] = line
+                self._waiting.setdefault(end, []).append(line)
 
     def flush(self) -> Iterator[Event]:
-        """Yield the pose whose lines were being gathered, and what waited for it."""
+        """Yield the pose whose edges were being gathered, and all that waited for it."""
         if self._pending is None:
             return
-        (frame_id, lines), self._pending = self._pending, None
-        yield self._pose(frame_id, lines)
-        yield from self._connect(frame_id)
-
-    def _connect(self, frame_id: int) -> Iterator[Event]:
-        """Yield what waited for a pose, and for the poses that come of it."""
+        frame_id, lines = self._pending
+        self._pending = None
+        yield self.pose(frame_id, lines)
         queue = deque([frame_id])
         while queue:
             near = queue.popleft()
             by_end: dict[int, list[g2o.Measurement]] = {}
-            for number, line in self._waiting.pop(near, {}).items():
+            for line in self._waiting.pop(near, []):
                 far = line.frame_id if line.reference_id == near else line.reference_id
-                self._waiting.get(far, {}).pop(number, None)
+                if far != near:
+                    self._waiting[far].remove(line)
                 by_end.setdefault(far, []).append(line)
             for far, lines in by_end.items():
                 if far in self.known:
                     for line in lines:
                         yield EdgeEvent(frame_id=line.frame_id, edge=_edge(line))
                 else:
-                    yield self._pose(far, lines)
+                    yield self.pose(far, lines)
                     queue.append(far)
 
-    def _pose(self, frame_id: int, lines: list[g2o.Measurement]) -> PoseEvent:
+    def pose(self, frame_id: int, lines: Iterable[g2o.Measurement] = ()) -> PoseEvent:
         self.known.add(frame_id)
         fixed = self._fixed.get(frame_id)
         return PoseEvent(

@@ -2,59 +2,60 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import median
-from typing import Protocol
 
 import numpy as np
 
-from gvo.errors import TrajectoryError
+from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
 from gvo.io.edges.events import Event, InputFaults, PoseEvent, anchor
 from gvo.trajectory.formats import read_trajectory
-from gvo.trajectory.trajectory import StampsFrom
-from gvo.types import Edge, FloatArray
+from gvo.trajectory.trajectory import Trajectory
+from gvo.types import BoolArray, Edge, FloatArray, IntArray
 
 MAX_GAP = 5.0
-"""Poses are interpolated between neighbours nearer in time than so many of the steps before."""
+"""Poses are interpolated between neighbours nearer in time than so many usual steps."""
 
-_N_STEPS = 51
 _MIN_RELATIVE_EIGENVALUE = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PoseSample:
-    """One pose of a stream.
+class PoseStream:
+    """Poses of one frame over time, in a world of their own.
 
     Parameters
     ----------
-    stamp_ns : int
-        Nanoseconds.
-    T_world_frame : ndarray of float64, shape (4, 4)
-        In the stream's own world, metres.
-    covariance : ndarray of float64, shape (6, 6), optional
-        Of the pose, (rx, ry, rz, tx, ty, tz), right perturbation, in the frame.
+    name : str
+        Of the file or topic.
+    poses : Trajectory
+        Without covariances.
+    covariances : ndarray of float64, shape (n, 6, 6)
+        Of the poses, (rx, ry, rz, tx, ty, tz), right perturbation, in the frame; NaN where not
+        known.
+    decision : str
+        How it was read; empty if there is nothing to say.
+    broken_off : str
+        Why it could not be read to its end; empty if it was.
     """
 
-    stamp_ns: int
-    T_world_frame: FloatArray
-    covariance: FloatArray | None = None
-
-
-class PoseStream(Protocol):
-    """Poses of one frame over time, in a world of its own; `stamps_from` as of `Trajectory`."""
-
     name: str
-    decisions: list[str]
-    n_poses: int
-    stamps_from: StampsFrom
+    poses: Trajectory
+    covariances: FloatArray
+    decision: str = ""
+    broken_off: str = ""
 
-    def samples(self, faults: InputFaults) -> Iterator[PoseSample]:
-        """Yield the poses; note in `faults` what was skipped."""
-        ...
+
+def read_stream(path: Path) -> PoseStream:
+    """Read the poses of a TUM, KITTI or EuRoC file, with the covariances of the file beside it."""
+    poses, decision = read_trajectory(path), ""
+    covariances = np.full((len(poses), 6, 6), np.nan)
+    if poses.covariances is not None:
+        covariances = poses.covariances
+        decision = f"{path.stem}: covariances of {path.stem}_covariance.csv"
+    poses = replace(poses, covariances=None)
+    return PoseStream(name=path.stem, poses=poses, covariances=covariances, decision=decision)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,29 +102,6 @@ class StepSigma:
         return f"{floor} and {100 * self.share:g} % of the motion and {turn}"
 
 
-class TrajectoryStream:
-    """The poses of a TUM, KITTI or EuRoC file, with the covariances of the file beside it."""
-
-    def __init__(self, path: Path) -> None:
-        self._trajectory = read_trajectory(path)
-        self.name = path.stem
-        self.n_poses = len(self._trajectory)
-        self.stamps_from: StampsFrom = self._trajectory.stamps_from
-        self.decisions: list[str] = []
-        if self._trajectory.covariances is not None:
-            self.decisions.append(f"{self.name}: covariances of {self.name}_covariance.csv")
-
-    def samples(self, faults: InputFaults) -> Iterator[PoseSample]:
-        """Yield the poses."""
-        covariances = self._trajectory.covariances
-        for i, stamp_ns in enumerate(self._trajectory.stamps_ns):
-            yield PoseSample(
-                stamp_ns=int(stamp_ns),
-                T_world_frame=self._trajectory.T_world_frame[i],
-                covariance=None if covariances is None else covariances[i],
-            )
-
-
 class FusedChains:
     """Several odometries of one moving frame, each a chain of edges, as one graph.
 
@@ -138,6 +116,8 @@ class FusedChains:
         At least one.
     sigmas : sequence of StepSigma
         One for each.
+    faults : InputFaults, optional
+        What could not be used when they were read.
 
     Raises
     ------
@@ -145,12 +125,17 @@ class FusedChains:
         Where some streams have stamps and some have not.
     """
 
-    def __init__(self, streams: Sequence[PoseStream], sigmas: Sequence[StepSigma]) -> None:
+    def __init__(
+        self,
+        streams: Sequence[PoseStream],
+        sigmas: Sequence[StepSigma],
+        faults: InputFaults | None = None,
+    ) -> None:
         self._streams, self._sigmas = streams, sigmas
         self.name = streams[0].name
-        self.faults = InputFaults()
-        self.n_poses = streams[0].n_poses
-        bare = [stream.stamps_from == "rows" for stream in streams]
+        self.faults = faults or InputFaults()
+        self.n_poses = len(streams[0].poses)
+        bare = [stream.poses.stamps_from == "rows" for stream in streams]
         if any(bare) and not all(bare):
             raise TrajectoryError(
                 f"{streams[bare.index(True)].name} holds rows of poses without stamps, "
@@ -158,7 +143,7 @@ class FusedChains:
                 "in seconds per row beside the poses"
             )
         self.has_made_up_stamps = all(bare)
-        self.decisions = [line for stream in streams for line in stream.decisions]
+        self.decisions = [stream.decision for stream in streams if stream.decision]
         if self.has_made_up_stamps:
             self.decisions.append("stamps: the row of each pose, a second each; no file has any")
         self.decisions += [
@@ -169,99 +154,75 @@ class FusedChains:
             self.decisions.append(f"fused at the {self.n_poses} poses of {self.name}")
 
     def events(self) -> Iterator[Event]:
-        """Yield the poses of the first stream, each with the edges of all streams."""
-        followers = [
-            _Follower(_ordered(stream, self.faults), sigma)
-            for stream, sigma in zip(self._streams[1:], self._sigmas[1:], strict=True)
-        ]
-        before: PoseSample | None = None
-        for sample in _ordered(self._streams[0], self.faults):
-            edges = [edge for follower in followers for edge in follower.edges(sample.stamp_ns)]
-            if before is not None:
-                edges.insert(0, _step(before, sample, self._sigmas[0]))
-            prior = anchor(sample.T_world_frame) if before is None else None
-            before = sample
+        """Yield the poses of the first stream, each with the edges of all streams.
+
+        Raises
+        ------
+        RecordingError
+            At the end, if a stream could not be read to its own.
+        """
+        first = self._streams[0].poses
+        pairs = zip(self._streams, self._sigmas, strict=True)
+        chains = [self._steps(stream, sigma, first.stamps_ns) for stream, sigma in pairs]
+        for i, stamp_ns in enumerate(first.stamps_ns.tolist()):
             yield PoseEvent(
-                frame_id=sample.stamp_ns, stamp_ns=sample.stamp_ns, edges=tuple(edges), prior=prior
+                frame_id=stamp_ns,
+                stamp_ns=stamp_ns,
+                edges=tuple(edge for edge in map(next, chains) if edge is not None),
+                prior=anchor(first.T_world_frame[0]) if i == 0 else None,
             )
-        for stream, follower in zip(self._streams[1:], followers, strict=True):
-            if follower.n_edges == 0:
-                kind = "inputs have no two poses at the stamps of the first and give no edge"
-                self.faults.add(kind, stream.name)
+        for stream in self._streams:
+            if stream.broken_off:
+                raise RecordingError(stream.broken_off)
+
+    def _steps(
+        self, stream: PoseStream, sigma: StepSigma, stamps_ns: IntArray
+    ) -> Iterator[Edge | None]:
+        """Yield for each stamp the edge from the one before, where the stream covers both."""
+        T, covariances, is_known = _at(stream, stamps_ns)
+        is_step = np.zeros(len(stamps_ns), dtype=np.bool_)
+        is_step[1:] = is_known[1:] & is_known[:-1]
+        if len(stamps_ns) > 1 and not is_step.any():
+            kind = "inputs have no two poses at the stamps of the first and give no edge"
+            self.faults.add(kind, stream.name)
+        for i, has_edge in enumerate(is_step.tolist()):
+            if not has_edge:
+                yield None
+                continue
+            T_a_b = se3.invert(T[i - 1]) @ T[i]
+            yield Edge(
+                reference_id=int(stamps_ns[i - 1]),
+                T_reference_frame=T_a_b,
+                covariance=step_covariance(T_a_b, covariances[i - 1], covariances[i], sigma),
+            )
 
 
-def _ordered(stream: PoseStream, faults: InputFaults) -> Iterator[PoseSample]:
-    """Yield the poses of a stream whose stamp is later than that before; count the others."""
-    last_ns: int | None = None
-    for sample in stream.samples(faults):
-        if last_ns is not None and sample.stamp_ns <= last_ns:
-            first = f"{sample.stamp_ns} ns after {last_ns} ns in {stream.name}"
-            faults.add("poses have a stamp that does not advance and were skipped", first)
-            continue
-        last_ns = sample.stamp_ns
-        yield sample
+def _at(stream: PoseStream, stamps_ns: IntArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Interpolate a stream: poses (n, 4, 4), covariances (n, 6, 6), and where they are known."""
+    own_ns = stream.poses.stamps_ns
+    T, covariances = np.empty((len(stamps_ns), 4, 4)), np.full((len(stamps_ns), 6, 6), np.nan)
+    if len(own_ns) == 0:
+        return T, covariances, np.zeros(len(stamps_ns), dtype=np.bool_)
+    steps_ns = np.diff(own_ns)
+    max_gap_ns = int(MAX_GAP * np.median(steps_ns)) if len(steps_ns) else 0
+    found = stream.poses.interpolate(stamps_ns, max_gap_ns=max_gap_ns)
+    is_known = np.isin(stamps_ns, found.stamps_ns)
+    T[is_known] = found.T_world_frame
+    is_own = np.isin(stamps_ns, own_ns)  # needs no interpolation
+    rows = np.searchsorted(own_ns, stamps_ns[is_own])
+    T[is_own], covariances[is_own] = stream.poses.T_world_frame[rows], stream.covariances[rows]
+    is_between = is_known & ~is_own
+    after = np.searchsorted(own_ns, stamps_ns[is_between])
+    spans_ns = own_ns[after] - own_ns[after - 1]
+    shares = ((stamps_ns[is_between] - own_ns[after - 1]) / spans_ns)[:, np.newaxis, np.newaxis]
+    before, beyond = stream.covariances[after - 1], stream.covariances[after]
+    covariances[is_between] = (1.0 - shares) * before + shares * beyond
+    return T, covariances, is_known
 
 
-class _Follower:
-    """A stream that is read along the stamps of another."""
-
-    def __init__(self, samples: Iterator[PoseSample], sigma: StepSigma) -> None:
-        self.n_edges = 0
-        self._samples, self._sigma = samples, sigma
-        self._before: PoseSample | None = None
-        self._after: PoseSample | None = next(samples, None)
-        self._steps_ns: deque[int] = deque(maxlen=_N_STEPS)
-        self._is_in_gap = False
-        self._last: PoseSample | None = None
-
-    def edges(self, stamp_ns: int) -> list[Edge]:
-        """Return the edge from the stamp asked for before, where the stream covers both."""
-        last, self._last = self._last, self._at(stamp_ns)
-        if last is None or self._last is None:
-            return []
-        self.n_edges += 1
-        return [_step(last, self._last, self._sigma)]
-
-    def _at(self, stamp_ns: int) -> PoseSample | None:
-        while self._after is not None and self._after.stamp_ns < stamp_ns:
-            self._before, self._after = self._after, next(self._samples, None)
-            if self._after is not None:
-                step_ns = self._after.stamp_ns - self._before.stamp_ns
-                usual_ns = median(self._steps_ns) if self._steps_ns else step_ns
-                self._is_in_gap = step_ns > MAX_GAP * usual_ns
-                self._steps_ns.append(step_ns)
-        if self._after is None or self._after.stamp_ns == stamp_ns:
-            return self._after
-        if self._before is None or self._is_in_gap:
-            return None
-        return _interpolate(self._before, self._after, stamp_ns)
-
-
-def _interpolate(before: PoseSample, after: PoseSample, stamp_ns: int) -> PoseSample:
-    """Interpolate linearly the position, along the shortest arc the rotation."""
-    share = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
-    T = se3.make_transform(
-        before.T_world_frame[:3, :3],
-        (1.0 - share) * before.T_world_frame[:3, 3] + share * after.T_world_frame[:3, 3],
-    )
-    turn = se3.log(se3.invert(before.T_world_frame) @ after.T_world_frame)
-    turn[3:] = 0.0
-    covariance = None
-    if before.covariance is not None and after.covariance is not None:
-        covariance = (1.0 - share) * before.covariance + share * after.covariance
-    T = T @ se3.exp(share * turn)
-    return PoseSample(stamp_ns=stamp_ns, T_world_frame=T, covariance=covariance)
-
-
-def _step(before: PoseSample, after: PoseSample, sigma: StepSigma) -> Edge:
-    return Edge(
-        reference_id=before.stamp_ns,
-        T_reference_frame=se3.invert(before.T_world_frame) @ after.T_world_frame,
-        covariance=step_covariance(before, after, sigma),
-    )
-
-
-def step_covariance(before: PoseSample, after: PoseSample, sigma: StepSigma) -> FloatArray:
+def step_covariance(
+    T_a_b: FloatArray, covariance_a: FloatArray, covariance_b: FloatArray, sigma: StepSigma
+) -> FloatArray:
     """Return the covariance of the step between two poses of one stream.
 
     The covariance of odometry grows with the way: the step's is the growth. Where there is no
@@ -270,27 +231,26 @@ def step_covariance(before: PoseSample, after: PoseSample, sigma: StepSigma) -> 
 
     Parameters
     ----------
-    before, after : PoseSample
+    T_a_b : ndarray of float64, shape (4, 4)
+    covariance_a, covariance_b : ndarray of float64, shape (6, 6)
+        Of both poses, NaN where not known.
     sigma : StepSigma
 
     Returns
     -------
     ndarray of float64, shape (6, 6)
-        Of (rx, ry, rz, tx, ty, tz), right perturbation, in the frame of `after`.
+        Of (rx, ry, rz, tx, ty, tz), right perturbation, in frame b.
     """
-    T_a_b = se3.invert(before.T_world_frame) @ after.T_world_frame
-    if before.covariance is None or after.covariance is None:
+    is_stated = np.isfinite(covariance_a).all()
+    if not is_stated or not _is_definite(covariance_b, scale=covariance_b):
         return sigma.covariance(T_a_b)
-    if not _is_definite(after.covariance, scale=after.covariance):
-        return sigma.covariance(T_a_b)
-    moved = se3.transport_covariance(before.covariance, se3.invert(T_a_b))
-    growth = after.covariance - moved
-    if _is_definite(growth, scale=after.covariance):
-        return np.asarray(0.5 * (growth + growth.T))
-    if not _is_definite(before.covariance, scale=before.covariance):
-        return sigma.covariance(T_a_b)
-    total = after.covariance + moved
-    return np.asarray(0.5 * (total + total.T))
+    moved = se3.transport_covariance(covariance_a, se3.invert(T_a_b))
+    step = covariance_b - moved
+    if not _is_definite(step, scale=covariance_b):
+        if not _is_definite(covariance_a, scale=covariance_a):
+            return sigma.covariance(T_a_b)
+        step = covariance_b + moved
+    return np.asarray(0.5 * (step + step.T))
 
 
 def _is_definite(matrix: FloatArray, *, scale: FloatArray) -> bool:

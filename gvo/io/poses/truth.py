@@ -14,7 +14,7 @@ from gvo._text import exists
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
 from gvo.io.bag.messages import bare
-from gvo.io.bag.poses import POSE_TYPES, POSITION_TYPES, TopicStream, find_topics, read_positions
+from gvo.io.bag.poses import POSE_TYPES, POSITION_TYPES, find_topics, pose_messages, read_positions
 from gvo.io.bag.reader import MessageReader
 from gvo.io.bag.topics import Topic
 from gvo.io.edges.events import InputFaults
@@ -161,28 +161,27 @@ def _of_chain(buffer: TfBuffer, spec: TfTruth, where: str) -> Poses:
 
 def _of_topic(reader: MessageReader, topic: Topic) -> Poses:
     faults = InputFaults()
-    stream = TopicStream(reader, topic)
-    # of several of one stamp the last counts, as in tf
-    poses = {sample.stamp_ns: sample.T_world_frame for sample in stream.samples(faults)}
+    child = ""
+    poses: dict[int, FloatArray] = {}  # of several of one stamp the last counts, as in tf
+    for pose in pose_messages(reader, topic, faults):
+        child, poses[pose.stamp_ns] = pose.child_frame, pose.T_parent_child
     if not poses:
         raise RecordingError(f"{topic.name}: holds no pose: {'; '.join(faults.warnings())}")
-    stamps_ns = np.array(sorted(poses), dtype=np.int64)
+    stamps_ns = sorted(poses)
     trajectory = Trajectory(
-        stamps_ns=stamps_ns,
-        T_world_frame=np.stack([poses[int(stamp_ns)] for stamp_ns in stamps_ns]),
+        stamps_ns=np.array(stamps_ns, dtype=np.int64),
+        T_world_frame=np.stack([poses[stamp_ns] for stamp_ns in stamps_ns]),
         stamps_from="topic",
     )
-    what = f"{len(stamps_ns)} poses"
-    return _described(topic, trajectory, stream.child_frame, what, faults.warnings())
+    return _described(topic, trajectory, child, f"{len(poses)} poses", faults.warnings())
 
 
 def _of_positions(reader: MessageReader, topic: Topic) -> Poses:
     faults = InputFaults()
-    found = read_positions(reader, topic, faults)
-    notes = [found.origin] if found.origin else []
-    what = f"{len(found.stamps_ns)} positions without rotations"
-    trajectory = Trajectory.of_positions(found.stamps_ns, found.positions, stamps_from="topic")
-    return _described(topic, trajectory, found.child_frame, what, notes + faults.warnings())
+    trajectory, child, origin = read_positions(reader, topic, faults)
+    notes = [*([origin] if origin else []), *faults.warnings()]
+    what = f"{len(trajectory)} positions without rotations"
+    return _described(topic, trajectory, child, what, notes)
 
 
 def _described(

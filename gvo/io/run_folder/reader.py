@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 import json
-from array import array
-from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, TypeAlias, cast, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from gvo._text import read_text, text_lines
 from gvo.errors import RecordingError, TrajectoryError
@@ -152,7 +151,7 @@ def read_run(folder: str | Path) -> RunRecord:
     return RunRecord(
         folder=folder,
         summary=summary,
-        frames=tables["frames"] or {name: _Column(name).values() for name in _REQUIRED["frames"]},
+        frames=tables["frames"] or {n: np.empty(0, dtype=_dtype(n)) for n in _REQUIRED["frames"]},
         edges=tables["edges"],
         timings=tables["timings"],
         loops=tables["loops"],
@@ -181,12 +180,12 @@ def _read_summary(path: Path) -> dict[str, Any]:
     return summary
 
 
-def _transform_fault(value: object) -> str:
+def _transform_fault(value: Any) -> str:  # noqa: ANN401 - of a file
     """Say why a value of a summary is no rigid transform; empty if it is one, or None."""
     if value is None:
         return ""
     try:
-        T = np.array(cast(ArrayLike, value), dtype=np.float64)
+        T = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         return "holds no numbers"
     if np.any(np.abs(T) > MAX_POSITION_M):
@@ -198,61 +197,56 @@ def _read_table(path: Path, required: Sequence[str]) -> Table:
     """Return the columns of a table, without an unfinished last line; empty where it is missing."""
     if not path.is_file():
         return {}
-    lines = text_lines(path, RecordingError, max_lines=MAX_LINES)
-    rows = csv.reader((line for _, line in lines if line.endswith("\n")), strict=True)
-    try:
-        names = next(rows, None)
-        return {} if names is None else _read_columns(path, names, rows, required)
-    except csv.Error as error:
-        raise RecordingError(f"{path}:{rows.line_num}: {error}; {_EXPECTED}") from error
-
-
-def _read_columns(
-    path: Path, names: list[str], rows: Iterable[list[str]], required: Sequence[str]
-) -> Table:
-    columns = {name: _Column(name) for name in names}
-    absent = [name for name in required if name not in columns]
-    if absent or len(columns) < len(names):
+    numbered = text_lines(path, RecordingError, max_lines=MAX_LINES)
+    lines = (line for _, line in numbered if line.endswith("\n") and line.strip())
+    names = next(lines, "").strip().split(",")
+    if names == [""]:
+        return {}
+    absent = [name for name in required if name not in names]
+    if absent or len(set(names)) < len(names):
         fault = f"no column {absent[0]}" if absent else "two columns of one name"
         raise RecordingError(f"{path}:1: {fault}; {_EXPECTED}")
-    name = ""
+    dtypes = {name: dtype for name in names if (dtype := _dtype(name)) is not None}
+    columns = [names.index(name) for name in dtypes]
+    first = next(lines, None)
+    if first is None:
+        return {name: np.empty(0, dtype=dtype) for name, dtype in dtypes.items()}
     try:
-        for number, row in enumerate(filter(None, rows), start=2):
-            if len(row) != len(names):
-                raise RecordingError(f"{path}:{number}: expected {len(names)} fields")
-            for name, value in zip(names, row, strict=True):
-                columns[name].append(value)
+        rows = np.loadtxt(
+            chain([first], lines),
+            dtype=[*dtypes.items()],
+            delimiter=",",
+            quotechar='"',
+            comments=None,
+            usecols=columns,
+            converters={
+                n: _CONVERTERS[dtype] for n, dtype in zip(columns, dtypes.values(), strict=True)
+            },
+            encoding="utf-8",
+            ndmin=1,
+        )
     except (ValueError, OverflowError) as error:
-        raise RecordingError(f"{path}: {name}: {error}; {_EXPECTED}") from error
-    return {name: column.values() for name, column in columns.items() if column.is_kept}
+        raise RecordingError(f"{path}: {error}; {_EXPECTED}") from error
+    return {name: rows[name] for name in dtypes}
 
 
-class _Column:
-    """The values of a column, in little memory: its name tells what they are."""
+def _dtype(name: str) -> type | None:
+    """Return what a column of this name holds; None for those that nobody reads."""
+    if name in ("status", "kind", "reason"):
+        return np.object_
+    if name == "is_accepted":
+        return np.bool_
+    if name in ("stamp_ns", "reference_ns") or name.startswith("n_"):
+        return np.int64
+    return np.float64 if name in ("chi2", "residual") or name.endswith(("_ms", "_m")) else None
 
-    def __init__(self, name: str) -> None:
-        self._convert: Callable[[str], Any] = str
-        self._values: Any = deque(maxlen=0)  # not kept
-        self._dtype: Any = None
-        self.is_kept = True
-        if name in ("status", "kind", "reason"):
-            known: dict[str, str] = {}
-            self._values, self._dtype = [], np.object_
-            self._convert = lambda text: known.setdefault(text, text)
-        elif name in ("stamp_ns", "reference_ns", "is_accepted") or name.startswith("n_"):
-            self._values, self._convert = array("q"), int
-            self._dtype = np.bool_ if name == "is_accepted" else np.int64
-        elif name in ("chi2", "residual") or name.endswith(("_ms", "_m")):
-            self._values, self._dtype = array("d"), np.float64
-            self._convert = lambda text: float(text or "nan")
-        else:
-            self.is_kept = False
 
-    def append(self, text: str) -> None:
-        self._values.append(self._convert(text))
-
-    def values(self) -> NDArray[Any]:
-        return np.array(self._values, dtype=self._dtype)
+_CONVERTERS: dict[type, Callable[[str], object]] = {
+    np.object_: sys.intern,
+    np.bool_: int,
+    np.int64: int,
+    np.float64: lambda text: float(text or "nan"),
+}
 
 
 def _read_estimate(folder: Path, name: str) -> Trajectory:

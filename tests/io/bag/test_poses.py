@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from gvo.errors import RecordingError
 from gvo.geometry import se3
-from gvo.io.bag.poses import POSE_TYPES, Positions, find_topics, open_streams, read_positions
+from gvo.io.bag.poses import POSE_TYPES, Positions, find_topics, read_positions, read_streams
 from gvo.io.bag.reader import BagReader
 from gvo.io.edges.events import InputFaults
-from gvo.io.edges.pose_streams import PoseSample
+from gvo.io.edges.pose_streams import PoseStream
 from gvo.types import FloatArray
 from tests.make.bags import ODOMETRY, STAMPED, TRANSFORM, PoseBag
 
@@ -38,85 +38,85 @@ def write(path: Path, topics: dict[str, str], norms: Sequence[float] = (1.0,) * 
     return bag.write()
 
 
-def read(path: Path, *names: str) -> tuple[list[PoseSample], InputFaults]:
+def read(path: Path, *names: str) -> tuple[PoseStream, InputFaults]:
     faults = InputFaults()
-    (stream,) = open_streams(path, names)
-    return list(stream.samples(faults)), faults
+    (stream,) = read_streams(path, names, faults)
+    return stream, faults
 
 
 @pytest.mark.parametrize("name", ["a.bag", "a.mcap", "a.db3"])
 @pytest.mark.parametrize("type_", POSE_TYPES)
 def test_poses_and_stamps_are_read_of_all_types(tmp_path: Path, name: str, type_: str) -> None:
-    samples, faults = read(write(tmp_path / name, {"/poses": type_}))
-    assert [sample.stamp_ns for sample in samples] == [(10 + n) * 10**9 + 7 for n in range(N)]
-    for n, sample in enumerate(samples):
-        np.testing.assert_allclose(sample.T_world_frame, pose(n), atol=1e-12)
-        assert (sample.covariance is None) == (type_ in (STAMPED, TRANSFORM))
+    stream, faults = read(write(tmp_path / name, {"/poses": type_}))
+    assert stream.poses.stamps_ns.tolist() == [(10 + n) * 10**9 + 7 for n in range(N)]
+    expected = np.stack([pose(n) for n in range(N)])
+    np.testing.assert_allclose(stream.poses.T_world_frame, expected, atol=1e-12)
+    assert np.isfinite(stream.covariances).all() == (type_ not in (STAMPED, TRANSFORM))
     assert not faults
 
 
 def test_the_covariance_of_a_message_is_that_of_its_own_perturbations(tmp_path: Path) -> None:
     """Draw poses as ROS means the numbers, and take the covariance of their right errors."""
-    samples, _ = read(write(tmp_path / "a.bag", {"/poses": ODOMETRY}))
+    stream, _ = read(write(tmp_path / "a.bag", {"/poses": ODOMETRY}))
     rng = np.random.default_rng(1)
-    for n, sample in enumerate(samples):
+    for n, C in enumerate(stream.covariances):
         T, small = pose(n), 1e-3
         draws = rng.multivariate_normal(np.zeros(6), covariance_ros(n), 20000) * small
         drawn = np.tile(T, (len(draws), 1, 1))
         drawn[:, :3, 3] += draws[:, :3]
         drawn[:, :3, :3] = Rotation.from_rotvec(draws[:, 3:]).as_matrix() @ T[:3, :3]
         expected = np.cov(se3.log(se3.invert(T) @ drawn).T) / small**2
-        C = sample.covariance
-        assert C is not None
         scale = np.sqrt(np.outer(np.diag(C), np.diag(C)))
         assert np.abs((C - expected) / scale).max() < 0.06
 
 
 def test_messages_without_a_rotation_are_skipped_and_counted(tmp_path: Path) -> None:
     path = write(tmp_path / "a.bag", {"/poses": STAMPED}, norms=(1.0, 0.0, 1.0, 1.0))
-    samples, faults = read(path)
-    assert len(samples) == N - 1
+    stream, faults = read(path)
+    assert len(stream.poses) == N - 1
     (warning,) = faults.warnings()
     assert warning.startswith("1 messages hold no pose")
+
+
+def test_stamps_that_go_back_are_skipped_and_counted(tmp_path: Path) -> None:
+    bag = PoseBag(tmp_path / "a.bag")
+    for stamp_ns in (10, 20, 20, 15, 30):
+        bag.pose("/poses", STAMPED, stamp_ns, pose(0))
+    stream, faults = read(bag.write())
+    assert stream.poses.stamps_ns.tolist() == [10, 20, 30]
+    (warning,) = faults.warnings()
+    assert warning.startswith("2 poses have a stamp that does not advance")
 
 
 def test_the_only_topic_is_taken_and_of_several_one_must_be_chosen(tmp_path: Path) -> None:
     path = write(tmp_path / "a.bag", {"/a": STAMPED, "/b": ODOMETRY})
     with pytest.raises(RecordingError, match=r"--topic NAME.*/a .*/b "):
-        open_streams(path, [])
-    names = [stream.name for stream in open_streams(path, ["b", "/a"])]
+        read(path)
+    names = [stream.name for stream in read_streams(path, ["b", "/a"], InputFaults())]
     assert names == ["/b", "/a"]
     with pytest.raises(RecordingError, match=r"no poses on topic /c.*/a .*/b "):
-        open_streams(path, ["/c"])
+        read(path, "/c")
 
 
 @pytest.mark.recorded
 def test_recorded_streams_are_read(gvo_data: Path) -> None:
-    path = gvo_data / "bags/good/pose_streams.bag"
-    (stream,) = open_streams(path, ["S-PTAM"])
-    assert len(list(stream.samples(InputFaults()))) == 5439
+    stream, _ = read(gvo_data / "bags/good/pose_streams.bag", "S-PTAM")
+    assert len(stream.poses) == 5439
+    odometry, _ = read(gvo_data / "bags/good/nav2_turtlebot.mcap", "/odom")
+    assert len(odometry.poses) == 2639
+    assert np.isfinite(odometry.covariances).all()
     for name in ("tf_example.bag", "realsense_rgbd.bag"):
         path = gvo_data / "bags/good" / name
         with pytest.raises(RecordingError, match="holds no poses"):
             find_topics(BagReader(path), [], name)
 
 
-@pytest.mark.recorded
-def test_recorded_wheel_odometry_has_covariances(gvo_data: Path) -> None:
-    (stream,) = open_streams(gvo_data / "bags/good/nav2_turtlebot.mcap", ["/odom"])
-    samples = list(stream.samples(InputFaults()))
-    assert len(samples) == 2639
-    assert all(sample.covariance is not None for sample in samples)
-
-
 def test_a_topic_tells_its_frames_and_keeps_to_them(tmp_path: Path) -> None:
     bag = PoseBag(tmp_path / "a.bag")
     for n, child in enumerate(["drone", "/drone", "wand", "drone"]):
         bag.pose("/vicon", TRANSFORM, n, pose(n), parent="/room", child=child)
-    (stream,) = open_streams(bag.write(), [])
-    faults = InputFaults()
-    assert [sample.stamp_ns for sample in stream.samples(faults)] == [0, 1, 3]
-    assert (stream.parent_frame, stream.child_frame) == ("room", "drone")
+    stream, faults = read(bag.write())
+    assert stream.poses.stamps_ns.tolist() == [0, 1, 3]
     assert "wand in room in place of drone in room" in faults.warnings()[0]
 
 
@@ -139,9 +139,11 @@ def test_fixes_are_east_north_and_up_of_the_first_one(tmp_path: Path, name: str)
         place = (60.0 + n * METRE_DEG, 25.0, 30.0 + 2.0 * n)
         bag.fix(n * 10**9 + 7, place, frame="/gps_link")
     found, faults = read_places(bag.write())
-    assert found.stamps_ns.tolist() == [7, 10**9 + 7, 2 * 10**9 + 7]
-    np.testing.assert_allclose(found.positions, [[0, n, 2 * n] for n in range(3)], atol=1e-3)
-    assert (found.child_frame, found.parent_frame) == ("gps_link", "")
+    assert found.trajectory.stamps_ns.tolist() == [7, 10**9 + 7, 2 * 10**9 + 7]
+    np.testing.assert_allclose(
+        found.trajectory.positions, [[0, n, 2 * n] for n in range(3)], atol=1e-3
+    )
+    assert found.child_frame == "gps_link"
     assert found.origin == "east, north, up of 60.0000000 deg, 25.0000000 deg, 30.00 m"
     assert not faults
 
@@ -153,8 +155,8 @@ def test_what_is_no_fix_is_skipped_and_counted_and_is_no_origin(tmp_path: Path) 
         bag.fix(n, spoilt)
     bag.fix(5, HELSINKI, status=2)
     found, faults = read_places(bag.write())
-    assert found.stamps_ns.tolist() == [5]
-    np.testing.assert_array_equal(found.positions, [[0.0, 0.0, 0.0]])
+    assert found.trajectory.stamps_ns.tolist() == [5]
+    np.testing.assert_array_equal(found.trajectory.positions, [[0.0, 0.0, 0.0]])
     (warning,) = faults.warnings()
     assert warning.startswith("5 messages hold no position and were skipped; the first: /fix at 0")
     assert "status -1" in warning
@@ -172,6 +174,6 @@ def test_points_are_positions_in_their_frame(tmp_path: Path) -> None:
     bag.point("/leica/position", 1, (1.0, 2.0, 3.0), frame="room")
     bag.point("/leica/position", 2, (NAN, 2.0, 3.0), frame="room")
     found, faults = read_places(bag.write())
-    np.testing.assert_array_equal(found.positions, [[1.0, 2.0, 3.0]])
-    assert (found.child_frame, found.parent_frame, found.origin) == ("", "room", "")
+    np.testing.assert_array_equal(found.trajectory.positions, [[1.0, 2.0, 3.0]])
+    assert (found.child_frame, found.origin) == ("", "")
     assert len(faults.warnings()) == 1
