@@ -157,7 +157,7 @@ def play(source: Source, answers: Answers, rate: float | None, n_ahead: int) -> 
         (pair[0].stamp_ns, pair[1].stamp_ns) for pair in found if not isinstance(pair, FaultyFrame)
     )
     first_ns, n_pairs = min(map(min, pairs)), len(pairs)
-    writer, streams = Writer(), plan_streams(source, rectify=False, compress=False)
+    writer, streams = Writer(), plan_streams(source, rectify=False)
     introduce(source, streams, writer, first_ns)
     begin_s = time.monotonic()
     sent: set[tuple[int, int]] = set()

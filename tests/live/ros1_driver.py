@@ -121,7 +121,7 @@ def interfere(index: int, stamp_ns: int, images: Any) -> None:
 def drive(recording: str) -> None:
     """Send pairs one by one, each when the last one is answered; change things in between."""
     source = gvo.open_recording(recording)
-    writer, streams = Writer(), plan_streams(source, rectify=False, compress=False)
+    writer, streams = Writer(), plan_streams(source, rectify=False)
     answers = Answers("/gvo/odom/odometry")
     images = list(source.images())
     pairs = [(a, b) for a, b in pairwise(images) if a.stamp_ns == b.stamp_ns]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -14,20 +14,10 @@ from gvo.errors import RecordingError
 from gvo.geometry.camera import Calibration
 from gvo.io.convert import bag_messages
 from gvo.io.convert.bag_messages import BagWriter, FramePose, Header
-from gvo.io.convert.target import (
-    BODY_FRAME,
-    LeftOut,
-    Options,
-    Target,
-    plan_images,
-    pose_of_right,
-    pose_on_body,
-    readable_images,
-)
+from gvo.io.convert.plan import BODY_FRAME, Form, Plan, plan_images, pose_of_right, pose_on_body
 from gvo.io.images import MILLIMETRES, exact_counts
 from gvo.io.poses.truth import TRUTH_FRAMES
 from gvo.io.recording import RecordingInfo, Source, StampedImage
-from gvo.types import FloatArray
 
 BagStreams: TypeAlias = tuple["BagStream", "BagStream"]
 
@@ -43,14 +33,11 @@ class BagStream(NamedTuple):
         Of images and `CameraInfo`: the optical frame of the rectified camera.
     calibration : Calibration
         Of the images as they are written.
-    is_compressed : bool
-        Written as PNG.
     """
 
     topic: str
     frame_id: str
     calibration: Calibration
-    is_compressed: bool
 
     @property
     def info_topic(self) -> str:
@@ -58,7 +45,7 @@ class BagStream(NamedTuple):
         return f"{self.topic.rpartition('/')[0]}/camera_info"
 
 
-class BagTarget(Target):
+class BagForm(Form):
     """A bag, whose frames are those of the recording, bit by bit.
 
     A stereo pair becomes `/stereo/left/image_rect` and `/stereo/right/image_rect`, or `image_raw`
@@ -70,56 +57,42 @@ class BagTarget(Target):
     those of the rectified cameras, also beside raw images.
     """
 
-    def __init__(self, path: Path, source: Source, left_out: LeftOut, options: Options) -> None:
-        super().__init__(path, source, left_out, options)
-        self._source = source
-        self._streams = plan_streams(source, rectify=options.rectify, compress=options.compress)
-        self.names = tuple(stream.topic for stream in self._streams)
-        self._poses: deque[tuple[int, FloatArray]] = deque()
-        if self.truth is not None:
-            rows = zip(self.truth.stamps_ns.tolist(), self.truth.T_world_frame, strict=True)
-            self._poses.extend(rows)
-        self.n_poses = len(self._poses)
+    def __init__(self, path: Path, plan: Plan) -> None:
+        super().__init__(path, plan)
+        self._streams = plan_streams(plan.source, rectify=plan.rectify)
+        plan.names = tuple(f"{stream.topic} images" for stream in self._streams)
+        is_depth_compressed = plan.info.sensor == "stereo" or _is_in_millimetres(plan.source)
+        self._is_compressed = (plan.compress, plan.compress and is_depth_compressed)
+        self._poses: list[FramePose] = []
+        if plan.truth is not None:
+            rows = zip(plan.truth.stamps_ns.tolist(), plan.truth.T_world_frame, strict=True)
+            self._poses = [FramePose(stamp_ns, *TRUTH_FRAMES, T) for stamp_ns, T in rows]
+        self._is_empty = True
         self._bag = BagWriter(path, keeps_order=True)
-
-    def __enter__(self) -> BagTarget:
-        self._bag.__enter__()
         self.path = self._bag.result
+
+    def __enter__(self) -> BagForm:
+        self._bag.__enter__()
         return self
 
     def __exit__(self, *exception: object) -> None:
         """Complete the bag."""
         self._bag.__exit__(*exception)
 
-    def select(self, images: Iterator[StampedImage]) -> Iterator[StampedImage]:
-        """Yield all images, each after the true poses up to its stamp."""
-        is_first = True
-        for image in images:
-            if is_first:
-                self._write_static(image.stamp_ns)
-                is_first = False
-            self._write_poses(image.stamp_ns)
-            yield image
-
-    def _write_static(self, stamp_ns: int) -> None:
-        # Whoever plays the bag knows the cameras before the first image or pose comes.
-        stamp_ns = min([stamp_ns, *(first_ns for first_ns, _ in list(self._poses)[:1])])
-        first, second = self._streams
-        poses = static_poses(self._source, (first.frame_id, second.frame_id), stamp_ns)
-        bag_messages.write_transforms(self._bag, "/tf_static", poses, is_latched=True)
-
-    def _write_poses(self, until_ns: float = np.inf) -> None:
-        while self._poses and self._poses[0][0] <= until_ns:
-            pose = FramePose(self._poses[0][0], *TRUTH_FRAMES, self._poses[0][1])
-            bag_messages.write_transforms(self._bag, "/tf", [pose])
-            self._poses.popleft()
+    def images(self) -> Iterator[StampedImage]:
+        """Yield all images."""
+        return self.plan.images()
 
     def write(self, image: StampedImage, pixels: NDArray[Any]) -> None:
-        """Write an image beside its calibration."""
-        stream = self._streams[image.stream]
+        """Write the true poses up to an image, and the image beside its calibration."""
+        if self._is_empty:
+            self._write_static(image.stamp_ns)
+            self._is_empty = False
+        self._write_poses(image.stamp_ns)
+        stream, is_compressed = self._streams[image.stream], self._is_compressed[image.stream]
         header = Header(image.stamp_ns, stream.frame_id)
         bag_messages.write_camera_info(self._bag, stream.info_topic, stream.calibration, header)
-        if not stream.is_compressed:
+        if not is_compressed:
             bag_messages.write_image(self._bag, stream.topic, pixels, header)
         elif pixels.dtype == np.float32:
             topic = f"{stream.topic}/compressedDepth"
@@ -128,35 +101,44 @@ class BagTarget(Target):
             topic = f"{stream.topic}/compressed"
             bag_messages.write_compressed(self._bag, topic, pixels, header)
 
+    def _write_static(self, stamp_ns: int) -> None:
+        # Whoever plays the bag knows the cameras before the first image or pose comes.
+        stamp_ns = min([stamp_ns, *(pose.stamp_ns for pose in self._poses[:1])])
+        first, second = self._streams
+        poses = static_poses(self.plan.source, (first.frame_id, second.frame_id), stamp_ns)
+        bag_messages.write_transforms(self._bag, "/tf_static", poses, is_latched=True)
+
+    def _write_poses(self, until_ns: float = np.inf) -> None:
+        while self.n_poses < len(self._poses) and self._poses[self.n_poses].stamp_ns <= until_ns:
+            bag_messages.write_transforms(self._bag, "/tf", [self._poses[self.n_poses]])
+            self.n_poses += 1
+
     def finish(self) -> None:
         """Write the true poses after the last image."""
         self._write_poses()
 
 
-def plan_streams(source: Source, *, rectify: bool, compress: bool) -> BagStreams:
+def plan_streams(source: Source, *, rectify: bool) -> BagStreams:
     """Decide where the streams of a recording go.
 
     Parameters
     ----------
     source : Source
-        The recording; of depth the first image is read where it is to be compressed.
+        The recording.
     rectify : bool
         Write raw images rectified and grey.
-    compress : bool
-        Write images as PNG; depth only where it is in whole millimetres.
     """
     info = source.info
     calibrations, _ = plan_images(info, rectify=rectify)
-    is_rectified, is_compressed = calibrations[0].is_rectified, (compress, compress)
+    is_rectified = calibrations[0].is_rectified
     if info.sensor == "rgbd":
         name = "image_rect_color" if is_rectified else "image_color"
         topics = (f"/camera/rgb/{name}", "/camera/depth/image")
         calibrations *= 2
-        is_compressed = (compress, compress and _is_in_millimetres(source))
     else:
         name = "image_rect" if is_rectified else "image_raw"
         topics = (f"/stereo/left/{name}", f"/stereo/right/{name}")
-    first, second = map(BagStream, topics, _frame_ids(info), calibrations, is_compressed)
+    first, second = map(BagStream, topics, _frame_ids(info), calibrations)
     return first, second
 
 
@@ -169,12 +151,11 @@ def _frame_ids(info: RecordingInfo) -> tuple[str, str]:
 
 def _is_in_millimetres(source: Source) -> bool:
     """Tell whether the first depth image that can be read is of whole millimetres."""
-    for image in readable_images(source, LeftOut()):
-        if image.stream == 1:
-            try:
-                return exact_counts(image.load(), MILLIMETRES) is not None
-            except RecordingError:
-                continue
+    with suppress(RecordingError):  # the recording breaks off
+        for image in source.images():
+            if image.stream == 1:
+                with suppress(RecordingError):
+                    return exact_counts(image.load(), MILLIMETRES) is not None
     return False
 
 

@@ -14,19 +14,19 @@ from rosbags.rosbag2 import WriterError as WriterError2
 from gvo.config import Config
 from gvo.errors import RecordingError, write_faults
 from gvo.io.bag.source import BagSource
-from gvo.io.convert.bag import BagTarget
-from gvo.io.convert.folders import EurocTarget, KittiTarget, TumTarget
-from gvo.io.convert.target import LeftOut, Options, Target, readable_images
+from gvo.io.convert.bag import BagForm
+from gvo.io.convert.folders import EurocForm, KittiForm, TumForm
+from gvo.io.convert.plan import Form, Plan
 from gvo.io.opening import BAG_SUFFIXES
 from gvo.io.recording import RecordingInfo, Source
 
 Layout: TypeAlias = Literal["bag", "kitti", "euroc", "tum"]
 
-_TARGETS: dict[Layout, type[Target]] = {
-    "bag": BagTarget,
-    "kitti": KittiTarget,
-    "euroc": EurocTarget,
-    "tum": TumTarget,
+_FORMS: dict[Layout, type[Form]] = {
+    "bag": BagForm,
+    "kitti": KittiForm,
+    "euroc": EurocForm,
+    "tum": TumForm,
 }
 
 
@@ -109,26 +109,31 @@ def convert(
         layout = "bag"
     _check(path, layout, compress=compress)
     layout = layout if layout == "bag" else _choose(source.info, layout, rectify=rectify)
-    left_out, options = LeftOut(), Options(rectify, compress, (config or Config()).sync)
+    sync = (config or Config()).sync
+    plan = Plan(source, rectify=rectify or layout == "kitti", compress=compress, sync=sync)
+    n_images = [0, 0]
     with (
         write_faults(RecordingError, path, WriterError1, WriterError2),
         tempfile.TemporaryDirectory(dir=path.parent, prefix=".convert-") as folder,
     ):
-        target = _TARGETS[layout](Path(folder) / path.name, source, left_out, options)
-        with target:
-            for image in target.select(readable_images(source, left_out)):
-                target.add(image)
+        with _FORMS[layout](Path(folder) / path.name, plan) as form:
+            for image in form.images():
+                pixels = plan.pixels(image)
+                if pixels is None:
+                    continue
+                form.write(image, pixels)
+                n_images[image.stream] += 1
                 if progress is not None:
-                    progress(sum(target.n_images))
-            _check_images(target)
-            target.finish()
-        target.path.rename(path)
-    return Conversion(
-        path=path,
-        n_images=sum(target.n_images),
-        n_poses=target.n_poses,
-        skipped=left_out.lines(),
-    )
+                    progress(sum(n_images))
+            if not all(n_images):
+                name = source.info.stream_names[n_images.index(0)]
+                reason = "; ".join(plan.skipped[:1]) or "the recording holds none"
+                raise RecordingError(
+                    f"{source.info.name}: no {name} image can be written: {reason}"
+                )
+            form.finish()
+        form.path.rename(path)
+    return Conversion(path=path, n_images=sum(n_images), n_poses=form.n_poses, skipped=plan.skipped)
 
 
 def check_new(path: Path) -> None:
@@ -170,11 +175,3 @@ def _choose(info: RecordingInfo, layout: Layout | None, *, rectify: bool) -> Lay
             f"{' or '.join(fitting)}"
         )
     return layout
-
-
-def _check_images(target: Target) -> None:
-    """Refuse a recording without an image of either stream, which no reader would take."""
-    if not all(target.n_images):
-        name = target.info.stream_names[target.n_images.index(0)]
-        reason = "; ".join(target.left_out.lines()[:1]) or "the recording holds none"
-        raise RecordingError(f"{target.info.name}: no {name} image can be written: {reason}")

@@ -186,7 +186,9 @@ def test_an_image_that_cannot_be_read_is_left_out_and_named(tmp_path: Path) -> N
         ListSource("stereo", items, calibrations=_stereo().info.calibrations), tmp_path / "a.bag"
     )
     assert conversion.n_images == 3
-    assert conversion.skipped == ("/stereo/left/image_rect at 20 ns: a.png: damaged",)
+    assert conversion.skipped == (
+        "1 /stereo/left/image_rect images were left out; the first: at 20 ns: a.png: damaged",
+    )
 
 
 def test_progress_is_told(tmp_path: Path) -> None:

@@ -1,13 +1,12 @@
-"""What all forms in which a recording is written share."""
+"""What of a recording is written, whatever the form."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
 from gvo.io.bag.source import BagSource
 from gvo.io.calibration.camera_info import rectified_calibration
+from gvo.io.edges.events import InputFaults
 from gvo.io.frames import ImagePreparer, make_preparers
 from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.trajectory.trajectory import Trajectory
@@ -26,91 +26,103 @@ from gvo.types import Failure, FloatArray
 BODY_FRAME = "body"
 """Name in tf of what the calibration of a data set places its cameras on."""
 
-_N_NAMED = 5
 _Preparers: TypeAlias = tuple[ImagePreparer | None, ImagePreparer | None]
 
 
-class LeftOut:
-    """Collects what a conversion leaves out, and why."""
+class Plan:
+    """The images as they are written, with their calibrations; true poses; what is left out.
 
-    def __init__(self) -> None:
-        self._lines: list[str] = []
-        self._n_images: Counter[str] = Counter()
+    Attributes
+    ----------
+    calibrations : tuple of Calibration
+        Of the images as they are written.
+    truth : Trajectory or None
+        T_world_cam of the rectified first camera.
+    names : tuple of two str
+        Of the streams, for messages.
+    notes : list of str
+        What is left out and why, a line each, besides images.
+    """
 
-    def add(self, line: str) -> None:
-        """Note one thing."""
-        self._lines.append(line)
+    def __init__(
+        self, source: Source, *, rectify: bool, compress: bool = False, sync: SyncConfig
+    ) -> None:
+        self.source, self.info, self.sync = source, source.info, sync
+        self.rectify, self.compress = rectify, compress
+        self.names = tuple(f"{name} images" for name in self.info.stream_names)
+        self.notes: list[str] = []
+        self._faults = InputFaults()
+        self.calibrations, self._preparers = plan_images(self.info, rectify=rectify)
+        self.truth = self._true_poses()
 
-    def add_image(self, name: str, stamp_ns: int, reason: str) -> None:
-        """Note an image of a stream; of many the first ones are named, and the rest counted."""
-        self._n_images[name] += 1
-        if self._n_images[name] <= _N_NAMED:
-            self._lines.append(f"{name} at {stamp_ns} ns: {reason}")
+    @property
+    def skipped(self) -> tuple[str, ...]:
+        """All that is left out, a line each; images are counted."""
+        return (*self.notes, *self._faults.warnings())
 
-    def lines(self) -> tuple[str, ...]:
-        """Return a line for each."""
-        rest = (
-            f"{name}: {n_images - _N_NAMED} more images left out"
-            for name, n_images in self._n_images.items()
-            if n_images > _N_NAMED
+    def images(self) -> Iterator[StampedImage]:
+        """Yield the images up to where the recording cannot be read on; note why."""
+        try:
+            yield from self.source.images()
+        except RecordingError as error:
+            self.notes.append(str(error))
+
+    def pixels(self, image: StampedImage) -> NDArray[Any] | None:
+        """Return the pixels of an image as they are written; None, noted, if it is damaged."""
+        prepare = self._preparers[image.stream]
+        try:
+            pixels = image.load()
+            return pixels if prepare is None else prepare(pixels)
+        except RecordingError as error:
+            self.leave_out(image.stream, image.stamp_ns, str(error))
+            return None
+
+    def leave_out(self, stream: int, stamp_ns: int, reason: str) -> None:
+        """Note an image that is not written."""
+        self._faults.add(f"{self.names[stream]} were left out", f"at {stamp_ns} ns: {reason}")
+
+    def _true_poses(self) -> Trajectory | None:
+        try:
+            truth = self.source.ground_truth()
+        except GvoError as error:
+            self.notes.append(f"ground truth: {error}")
+            return None
+        if truth is None or truth.has_rotations:
+            return truth
+        self.notes.append(
+            f"ground truth: {len(truth)} positions without rotations are no poses of the camera"
         )
-        return (*self._lines, *rest)
+        return None
 
 
-class Options(NamedTuple):
-    """How a recording is written: rectified, images of bags as PNG, what a pair is."""
-
-    rectify: bool
-    compress: bool
-    sync: SyncConfig
-
-
-class Target(AbstractContextManager["Target"], ABC):
+class Form(AbstractContextManager["Form"], ABC):
     """A new bag or folder: takes images one by one inside a `with` block, in the end `finish`.
 
     Attributes
     ----------
     path : Path
         The file or folder.
-    n_images : list of two int
-        Images written, by stream.
     n_poses : int
         True poses written, once it is finished.
     """
 
-    def __init__(self, path: Path, source: Source, left_out: LeftOut, options: Options) -> None:
-        self.path, self.left_out, self.info = path, left_out, source.info
-        self.n_images, self.n_poses = [0, 0], 0
-        self.names = tuple(f"{name} image" for name in self.info.stream_names)
-        self.calibrations, self.preparers = plan_images(self.info, rectify=options.rectify)
-        self.truth = _true_poses(source, left_out)
+    def __init__(self, path: Path, plan: Plan) -> None:
+        self.path, self.plan, self.n_poses = path, plan, 0
 
     def __exit__(self, *exception: object) -> None:
         """Close what is open."""
 
-    def select(self, images: Iterator[StampedImage]) -> Iterator[StampedImage]:
+    def images(self) -> Iterator[StampedImage]:
         """Yield the images that the form can hold: those with a stamp of their own."""
         last_ns: list[int | None] = [None, None]
-        for image in images:
+        for image in self.plan.images():
             before_ns = last_ns[image.stream]
             if before_ns is not None and image.stamp_ns <= before_ns:
                 reason = f"the stamp does not advance from {before_ns} ns"
-                self.left_out.add_image(self.names[image.stream], image.stamp_ns, reason)
+                self.plan.leave_out(image.stream, image.stamp_ns, reason)
                 continue
             last_ns[image.stream] = image.stamp_ns
             yield image
-
-    def add(self, image: StampedImage) -> None:
-        """Write an image; note where it cannot be read."""
-        prepare = self.preparers[image.stream]
-        try:
-            pixels = image.load()
-            pixels = pixels if prepare is None else prepare(pixels)
-        except RecordingError as error:
-            self.left_out.add_image(self.names[image.stream], image.stamp_ns, str(error))
-            return
-        self.write(image, pixels)
-        self.n_images[image.stream] += 1
 
     @abstractmethod
     def write(self, image: StampedImage, pixels: NDArray[Any]) -> None:
@@ -119,29 +131,6 @@ class Target(AbstractContextManager["Target"], ABC):
     @abstractmethod
     def finish(self) -> None:
         """Write what is known at the end: calibrations, tables, true poses."""
-
-
-def readable_images(source: Source, left_out: LeftOut) -> Iterator[StampedImage]:
-    """Yield the images up to where a recording cannot be read on; note why."""
-    try:
-        yield from source.images()
-    except RecordingError as error:
-        left_out.add(str(error))
-
-
-def _true_poses(source: Source, left_out: LeftOut) -> Trajectory | None:
-    """Return T_world_cam of the rectified first camera; None, with a note, if not poses."""
-    try:
-        truth = source.ground_truth()
-    except GvoError as error:
-        left_out.add(f"ground truth: {error}")
-        return None
-    if truth is not None and not truth.has_rotations:
-        left_out.add(
-            f"ground truth: {len(truth)} positions without rotations are no poses of the camera"
-        )
-        return None
-    return truth
 
 
 def plan_images(
