@@ -5,8 +5,8 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Generator, Iterable
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -102,17 +102,23 @@ def start(*arguments: object) -> subprocess.Popen[str]:
     )
 
 
-def interrupt(
-    process: subprocess.Popen[str], table: Path, number: signal.Signals = signal.SIGINT
-) -> tuple[int, str]:
-    """Send a signal when a run has three rows of a table; return its exit code and last words."""
-    deadline = time.monotonic() + 60
-    while not (table.exists() and table.read_text().count("\n") >= 4):
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-    process.send_signal(number)
-    _, errors = process.communicate(timeout=60)
-    return process.returncode, errors
+def interrupt_at_call(
+    monkeypatch: pytest.MonkeyPatch,
+    owner: object,
+    name: str,
+    n: int,
+    number: int = signal.SIGTERM,
+) -> None:
+    """Raise a signal in this process at the nth call of a method."""
+    calls = count(1)  # threads may call at once
+    original = getattr(owner, name)
+
+    def call(*arguments: Any, **options: Any) -> Any:
+        if next(calls) == n:
+            os.kill(os.getpid(), number)
+        return original(*arguments, **options)
+
+    monkeypatch.setattr(owner, name, call)
 
 
 def refused(answer: Answer | subprocess.CompletedProcess[str]) -> str:

@@ -49,13 +49,6 @@ class Output(Protocol):
         """Write the global poses and the loops, at the end."""
 
 
-class FileOutput(Output, Protocol):
-    """An output to a file, which `close` completes."""
-
-    def close(self) -> None:
-        """Complete the file; a second call does nothing."""
-
-
 class RunLoop:
     """Odometry over a recording, or a part of it.
 

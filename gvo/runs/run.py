@@ -23,7 +23,8 @@ from gvo.io.poses.truth import Truth, TruthComparison, initial_pose
 from gvo.io.recording import Source
 from gvo.io.run_folder.reader import read_run, trajectory_names
 from gvo.io.run_folder.writer import GLOBAL, PICTURE, REPORT, RunFolder, save_summary, written_alone
-from gvo.runs.loop import FileOutput, Output, RunLoop, motions_of_window
+from gvo.runs.loop import Output, RunLoop, motions_of_window
+from gvo.runs.outputs.file import FileOutput
 from gvo.runs.outputs.options import RunOutputs
 from gvo.runs.summary import RunningSummary, optimum_json, run_identity, summarize
 from gvo.trajectory.alignment import MAX_DIFFERENCE_NS
@@ -164,7 +165,7 @@ def _save(loop: RunLoop, folder: RunFolder, summary: RunningSummary) -> None:
         folder.add_optimum(optimum)
 
 
-def _close(files: Iterable[FileOutput]) -> list[str]:
+def _close(files: Iterable[RunFolder | FileOutput]) -> list[str]:
     """Close the files; return the reasons why some could not be completed."""
     faults: list[str] = []
     for file in files:

@@ -18,12 +18,13 @@ import numpy as np
 import pytest
 
 import gvo
+from gvo.frontend.klt import KltFrontend
 from tests.conftest import (
     GVO,
     Command,
     assert_open_to_this_machine_alone,
     assert_same_files,
-    interrupt,
+    interrupt_at_call,
     python,
     refused,
     start,
@@ -80,7 +81,6 @@ def drawn(drive_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("drawn")
     options = [
         *("--overlay", out / "film.webm"),
-        *("--rerun", out / "run.rrd"),
         *("--plots", out / "plots"),
     ]
     done = python(*GVO[1:], "run", drive_bag, "--out", out, "--duration", "0.6", *options)
@@ -98,7 +98,7 @@ def test_drawing_changes_nothing_of_the_run(
     answer = command(*arguments)
     assert (answer.code, answer.err) == (0, "")
     assert_same_files(tmp_path, drawn)
-    drawings = {"trajectories.png", "report.html", "film.webm", "run.rrd", "plots"}
+    drawings = {"trajectories.png", "report.html", "film.webm", "plots"}
     assert names_of(drawn) - names_of(tmp_path) == drawings
 
 
@@ -115,7 +115,7 @@ def test_the_report_is_one_file_with_the_plots_beside_it(drawn: Path) -> None:
     assert all(starts_rightly(path) for path in plots)
 
 
-def test_the_film_shows_each_frame_and_the_stream_is_of_rerun(drawn: Path) -> None:
+def test_the_film_shows_each_frame(drawn: Path) -> None:
     start = (drawn / "film.webm").read_bytes()[:4096]
     assert start.startswith(WEBM_START)
     assert b"V_VP8" in start
@@ -123,7 +123,21 @@ def test_the_film_shows_each_frame_and_the_stream_is_of_rerun(drawn: Path) -> No
     assert len(frames) == count_rows(drawn / "frames.csv") == 6
     assert all(frame.std() > 10.0 for frame in frames)
     assert all(np.any(one != other) for one, other in pairwise(frames))
-    assert starts_rightly(drawn / "run.rrd")
+
+
+@pytest.mark.rerun
+def test_a_run_is_written_for_rerun_beside_the_same_files(
+    command: Command, drive_bag: Path, drawn: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("rerun")
+    stream, out = tmp_path / "run.rrd", tmp_path / "out"
+    options = ["--duration", "0.6", "--no-report", "--rerun", stream]
+    answer = command("run", drive_bag, "--out", out, *options)
+    assert (answer.code, answer.err) == (0, "")
+    assert starts_rightly(stream)
+    assert_same_files(out, drawn)
+    refused_stream = command("run", drive_bag, "--out", tmp_path / "o", "--rerun", "run.rr")
+    assert ".rrd" in refused(refused_stream)
 
 
 def test_a_film_is_a_player_s_or_a_folder_of_pictures_where_it_is_asked_for(
@@ -199,21 +213,20 @@ def test_errors_are_printed_if_the_page_cannot_be_written(command: Command, tmp_
 
 
 def test_what_is_written_beside_an_interrupted_run_holds_all_frames_until_then(
-    drive_bag: Path, tmp_path: Path
+    command: Command, monkeypatch: pytest.MonkeyPatch, drive_bag: Path, tmp_path: Path
 ) -> None:
-    film, stream, bag = (tmp_path / name for name in ("film.webm", "run.rrd", "run.mcap"))
-    options = ["--overlay", film, "--rerun", stream, "--bag", bag]
-    process = start("run", drive_bag, "--out", tmp_path, *options)
-    frames = tmp_path / "frames.csv"
-    found, errors = interrupt(process, frames, signal.SIGINT)
-    assert (found, errors.count("\n")) == (130, 1)
-    assert errors.startswith("gvo: interrupted; ")
-    assert len(film_frames(film)) == count_rows(frames) < 20
-    assert starts_rightly(stream)
+    film, bag = tmp_path / "film.webm", tmp_path / "run.mcap"
+    interrupt_at_call(monkeypatch, KltFrontend, "extract", 4)
+    answer = command("run", drive_bag, "--out", tmp_path, "--overlay", film, "--bag", bag)
+    assert (answer.code, answer.err.count("\n")) == (143, 1)
+    assert answer.err.startswith("gvo: interrupted; ")
+    assert len(film_frames(film)) == count_rows(tmp_path / "frames.csv") < 20
     messages = read_bag(bag)
     for name in ("raw", "causal", "smoothed"):
         n_poses = len(gvo.read_trajectory(tmp_path / f"{name}.txt"))
-        assert len(messages[f"/gvo/{name}/odometry"]) == n_poses == count_rows(frames)
+        assert (
+            len(messages[f"/gvo/{name}/odometry"]) == n_poses == count_rows(tmp_path / "frames.csv")
+        )
     assert (tmp_path / "report.html").exists()
 
 

@@ -5,6 +5,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from gvo.runs.smooth import Smoother
 from gvo.trajectory import evaluation
 from gvo.viz import plots
 from gvo.viz.report import run as report
-from tests.conftest import Command, line_of_poses
+from tests.conftest import Command, interrupt_at_call, line_of_poses
 
 ANEW = "the same command begins anew"
 UNDRAWN = (
@@ -35,20 +36,7 @@ Interrupt = Callable[..., None]
 @pytest.fixture
 def interrupt(monkeypatch: pytest.MonkeyPatch) -> Interrupt:
     """Return a function that makes a call of a method raise a signal in this process."""
-
-    def at_call(owner: object, name: str, n: int, number: int = signal.SIGTERM) -> None:
-        calls = []
-        original = getattr(owner, name)
-
-        def call(*arguments: Any, **options: Any) -> Any:
-            calls.append(1)
-            if len(calls) == n:
-                os.kill(os.getpid(), number)
-            return original(*arguments, **options)
-
-        monkeypatch.setattr(owner, name, call)
-
-    return at_call
+    return partial(interrupt_at_call, monkeypatch)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

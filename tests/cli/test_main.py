@@ -225,8 +225,6 @@ def test_compare_counts_repeated_rows_and_needs_3_poses(command: Command, tmp_pa
         (["view", "{bag}", "--color", "/nothing"], ["/nothing"]),
         (["run", "{bag}", "--out", "out", "--overlay", "film.avi"], ["film.avi", ".webm"]),
         (["run", "{bag}", "--out", "out", "--overlay", "text.txt/film.webm"], ["text.txt"]),
-        (["run", "{bag}", "--out", "out", "--rerun", "run.rr"], ["run.rr", ".rrd"]),
-        (["run", "{bag}", "--out", "out", "--rerun", "text.txt/run.rrd"], ["text.txt"]),
         (["run", "{bag}", "--out", "out", "--no-report", "--plots", "p"], ["--plots"]),
         (["run", "{bag}", "--out", "out", "--every", "9", "--plots", "text.txt"], ["text.txt"]),
     ],

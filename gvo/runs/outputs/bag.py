@@ -43,7 +43,6 @@ the length of the run, not with its square; those at the end hold all poses.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from itertools import chain, count
 from pathlib import Path
@@ -67,6 +66,7 @@ from gvo.io.convert.bag_messages import (
 )
 from gvo.io.run_folder.line_file import PartFile
 from gvo.runs.outputs import bag_messages as messages
+from gvo.runs.outputs.file import FileOutput
 from gvo.runs.outputs.frames import ODOM, RunFrames, twist_between
 from gvo.types import (
     Estimate,
@@ -262,11 +262,8 @@ class RunMessages:
                 messages.write_path(self._writer, topic, header, *paths[name])
 
 
-class RunBag(AbstractContextManager["RunBag"]):
-    """A bag of the results of a run, open inside a `with` block.
-
-    It is written under another name in the same folder and takes its own when it is closed, also
-    where the run is interrupted. Without a single frame no file is left.
+class RunBag(RunMessages, FileOutput):
+    """A bag of the results of a run, see `FileOutput`.
 
     Parameters
     ----------
@@ -282,7 +279,6 @@ class RunBag(AbstractContextManager["RunBag"]):
 
     def __init__(self, path: str | Path, frames: RunFrames | None = None) -> None:
         self.path = Path(path)
-        self._is_open = True
         if self.path.suffix not in SUFFIXES:
             raise RecordingError(
                 f"{path}: expected a name ending in .mcap (ROS 2) or .bag (ROS 1), got "
@@ -290,45 +286,34 @@ class RunBag(AbstractContextManager["RunBag"]):
             )
         self._file = PartFile(self.path, WriterError1, WriterError2)
         with self._file.refused_on_error():
-            self._bag = BagWriter(self._file.part).__enter__()
-        self._messages = RunMessages(self._bag, frames or RunFrames())
+            self._bag = _PartWriter(self._file)
+            self._bag.__enter__()
+        super().__init__(self._bag, frames or RunFrames())
 
-    def add_frame(self, frame: Frame, result: FrameResult) -> None:
-        """Write the result of a frame, see `RunMessages`."""
-        with self._file.refused_on_error():
-            self._messages.add_frame(frame, result)
-
-    def add_faulty(self, frame: FaultyFrame) -> None:
-        """Write a frame without a pose to the diagnostics."""
-        with self._file.refused_on_error():
-            self._messages.add_faulty(frame)
-
-    def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
-        """Write smoothed poses of the base frame that are final, in any order."""
-        with self._file.refused_on_error():
-            self._messages.add_smoothed(estimates)
-
-    def add_optimum(self, optimum: Optimum) -> None:
-        """Write the global poses of the base frame, and the loops that count."""
-        with self._file.refused_on_error():
-            self._messages.add_optimum(optimum)
-
-    def close(self) -> None:
-        """Write the whole paths and give the file its name; a second call does nothing."""
-        if not self._is_open:
-            return
-        self._is_open = False
-        with self._file.completed(is_kept=self._messages.has_frames):
+    def _complete(self) -> None:
+        """Write the whole paths and give the file its name."""
+        with self._file.completed(is_kept=self.has_frames):
             try:
-                if self._messages.has_frames:
-                    self._messages.write_paths()
+                if self.has_frames:
+                    self.write_paths()
             finally:
                 self._bag.__exit__(None, None, None)
                 self._file.part = self._bag.result
 
-    def __exit__(self, *exception: object) -> None:
-        """Close it."""
-        self.close()
+
+class _PartWriter(BagWriter):
+    """Writes a bag; what cannot be written is a RecordingError."""
+
+    def __init__(self, file: PartFile) -> None:
+        super().__init__(file.part)
+        self._file = file
+
+    def write(
+        self, topic: str, type_: str, message: object, stamp_ns: int, *, is_latched: bool = False
+    ) -> None:
+        """Write a message."""
+        with self._file.refused_on_error():
+            super().write(topic, type_, message, stamp_ns, is_latched=is_latched)
 
 
 def _numbers(result: FrameResult, counts: dict[str, int]) -> dict[str, object]:

@@ -11,7 +11,8 @@ from gvo.errors import ConfigurationError, RecordingError, named_faults, write_f
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import Source
 from gvo.io.run_folder.line_file import check_folder, check_new
-from gvo.runs.loop import FileOutput, RunLoop
+from gvo.runs.loop import RunLoop
+from gvo.runs.outputs.file import FileOutput
 from gvo.runs.outputs.frames import RunFrames
 
 

@@ -33,13 +33,10 @@ positions in single precision.
 
 from __future__ import annotations
 
-import os
 from array import array
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from pathlib import Path
-from threading import Thread
 from typing import Final
 
 import cv2
@@ -54,6 +51,7 @@ from gvo.geometry.camera import PinholeCamera
 from gvo.io.convert.bag_messages import pose_numbers
 from gvo.io.images import encode_image
 from gvo.io.run_folder.line_file import PartFile
+from gvo.runs.outputs.file import FileOutput
 from gvo.runs.outputs.frames import RunFrames
 from gvo.types import (
     Estimate,
@@ -91,8 +89,6 @@ _TRACKED, _CAMERA = "world/causal/frame", "world/causal/frame/camera"
 _CLOUD, _LOOPS = "world/cloud", "world/loops"
 _OVERLAY, _COUNTS, _MILLISECONDS, _CHI2 = "overlay", "counts", "milliseconds", "chi2"
 _STATUS, _CONFIGURATION = "status", "configuration"
-_N_BATCHED_BYTES, _N_PIPED_BYTES = 2**23, 2**20
-_TICK_S = 3600.0  # nothing is written by the clock, so that chunks depend on the frames alone
 _COUNTED = ("matches", "inliers", "points")
 _LEVELS: Final = {
     Status.OK: rr.TextLogLevel.INFO,
@@ -108,12 +104,8 @@ _DOT: Final = rr.Radius.ui_points(4.0)
 _SMALL_DOT: Final = rr.Radius.ui_points(1.5)
 
 
-class RunRerun(AbstractContextManager["RunRerun"]):
-    """A Rerun file of the results of a run, open inside a `with` block.
-
-    It is written under another name in the same folder and takes its own when it is closed, also
-    where the run is interrupted. Without a single frame no file is left. No viewer is needed, and
-    none is started.
+class RunRerun(FileOutput):
+    """A Rerun file of the results of a run, see `FileOutput`; no viewer is started.
 
     Parameters
     ----------
@@ -149,7 +141,6 @@ class RunRerun(AbstractContextManager["RunRerun"]):
         self._stamps_ns, self._indices = array("q"), array("q")  # of the frames with a pose
         self._is_dated: bool | None = None
         self._series: set[str] = set()
-        self._is_open = True
         if self.path.suffix != SUFFIX:
             raise RecordingError(
                 f"{path}: expected a name ending in {SUFFIX}, got {self.path.name}"
@@ -157,18 +148,17 @@ class RunRerun(AbstractContextManager["RunRerun"]):
         self._open(config)
 
     def _open(self, config: Config | None) -> None:
-        batches = rr.ChunkBatcherConfig(flush_tick=_TICK_S, flush_num_bytes=_N_BATCHED_BYTES)
-        self._recording = rr.RecordingStream("gvo", send_properties=False, batcher_config=batches)
+        self._recording = rr.RecordingStream("gvo", send_properties=False)
         if not rr.is_enabled(self._recording):
             raise ConfigurationError(
                 "--rerun: the environment variable RERUN switches rerun off; unset it"
             )
         self._recording.set_log_time_enabled(False)
-        self._file = PartFile(self.path, RuntimeError)  # which rerun raises
-        with self._file.refused_on_error():
-            self._pipe = _FilePipe(self._file.part)
-            self._recording.save(self._pipe.entrance, default_blueprint=_layout())
-        self._pipe.leave()
+        self._part = PartFile(self.path)
+        with self._part.refused_on_error():
+            self._file = self._part.part.open("wb")
+        self._stream = self._recording.binary_stream()
+        self._recording.send_blueprint(_layout())
         self._recording.send_recording_name(self.path.stem)
         self._log(f"{_CAMERA}/image", _pinhole(self._camera), is_static=True)
         for name in ESTIMATES:
@@ -196,9 +186,7 @@ class RunRerun(AbstractContextManager["RunRerun"]):
         self._add_numbers(seen)
         self._add_late("smoothed", result.finished)
         if len(self._stamps_ns) % N_FRAMES_HELD == 0:
-            with self._file.refused_on_error():
-                self._recording.flush()
-                self._pipe.check()
+            self._write()
 
     def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
         """Write smoothed poses of the base frame that are final, in any order."""
@@ -219,23 +207,18 @@ class RunRerun(AbstractContextManager["RunRerun"]):
         """Write a frame without a pose to the log."""
         self._add_status(frame.stamp_ns, Status.SKIPPED, f"skipped: {frame.reason}")
 
-    def close(self) -> None:
-        """Write the whole paths and give the file its name; a second call does nothing."""
-        if not self._is_open:
-            return
-        self._is_open = False
-        with self._file.completed(is_kept=len(self._stamps_ns) > 0):
+    def _complete(self) -> None:
+        """Write the whole paths and give the file its name."""
+        with self._part.completed(is_kept=len(self._stamps_ns) > 0), self._file:
             if self._stamps_ns:
                 self._set_frame(self._stamps_ns[-1])
                 self._add_paths(self._history.paths())
-            self._recording.flush()
-            self._recording.disconnect()
-            self._pipe.join()
-            self._pipe.check()
+            self._write()
 
-    def __exit__(self, *exception: object) -> None:
-        """Close it."""
-        self.close()
+    def _write(self) -> None:
+        """Write to the file what was logged since the last time."""
+        with self._part.refused_on_error():
+            self._file.write(self._stream.read() or b"")
 
     def _log(self, entity: str, archetype: rr.AsComponents, *, is_static: bool = False) -> None:
         """Log to an entity, at the frame that was set or for all frames."""
@@ -338,44 +321,6 @@ class RunRerun(AbstractContextManager["RunRerun"]):
             series = rr.SeriesLines(names=name, colors=colour, widths=1.5)
             self._log(entity, series, is_static=True)
         self._log(entity, rr.Scalars([value]))
-
-
-class _FilePipe:
-    """A pipe into a file; rerun's own writer may wait for ever where a write fails."""
-
-    def __init__(self, path: Path) -> None:
-        self._error: OSError | None = None
-        self._file = path.open("wb", buffering=0)
-        self._reader, self._writer = os.pipe()
-        self.entrance = Path(f"/dev/fd/{self._writer}")
-        self._thread = Thread(target=self._copy, name="gvo-file-pipe", daemon=True)
-        self._thread.start()
-
-    def leave(self) -> None:
-        """Close this end: the file ends when rerun closes its own."""
-        os.close(self._writer)
-
-    def join(self) -> None:
-        """Wait for the end of the file."""
-        self._thread.join()
-
-    def check(self) -> None:
-        """Raise the OSError of what could not be written so far."""
-        if self._error is not None:
-            raise self._error
-
-    def _copy(self) -> None:
-        with self._file, os.fdopen(self._reader, "rb", buffering=0) as pipe:
-            while data := pipe.read(_N_PIPED_BYTES):
-                self._keep(data)
-
-    def _keep(self, data: bytes) -> None:
-        """Write, and drop all after what could not be written."""
-        try:
-            while data and self._error is None:
-                data = data[self._file.write(data) :]
-        except OSError as error:
-            self._error = error
 
 
 def _layout() -> rrb.Blueprint:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Final, TypeAlias
 
 from gvo.geometry.camera import PinholeCamera
-from gvo.types import Estimate, FaultyFrame, Frame, FrameResult, Loop, Optimum
+from gvo.runs.outputs.file import FileOutput
+from gvo.types import FaultyFrame, Frame, FrameResult, Loop
 from gvo.viz.overlay import MIN_WIDTH_PX, Layout, compose_faulty, compose_overlay
 from gvo.viz.video import open_sink
 
@@ -24,13 +23,11 @@ _N_WAITING = 4  # frames; each holds its images
 _Item: TypeAlias = tuple[Frame, FrameResult] | FaultyFrame
 
 
-class RunOverlay(AbstractContextManager["RunOverlay"]):
-    """A film of a run, open inside a `with` block: one picture per frame, also of faulty ones.
+class RunOverlay(FileOutput):
+    """A film of a run, see `FileOutput`: one picture per frame, also of faulty ones.
 
     It plays as fast as it was recorded, by the median of the first eight periods. A thread draws
-    and encodes; the run waits for it only where it is four frames behind. The film is written
-    under another name in the same folder and takes its own when it is closed, also where the run
-    is interrupted. Without a single frame no file is left.
+    and encodes; the run waits for it only where it is four frames behind.
 
     Parameters
     ----------
@@ -59,7 +56,6 @@ class RunOverlay(AbstractContextManager["RunOverlay"]):
         self._sink = open_sink(Path(path))
         self.decisions = self._sink.decisions
         self._n = 0
-        self._is_open = True
         self._loops: tuple[Loop, ...] = ()
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="overlay")
         self._waiting: deque[Future[None]] = deque()
@@ -72,27 +68,14 @@ class RunOverlay(AbstractContextManager["RunOverlay"]):
         """Take a frame without a pose; its picture says why."""
         self._put(frame)
 
-    def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
-        """Take smoothed poses, which the film does not show."""
-
-    def add_optimum(self, optimum: Optimum) -> None:
-        """Take the global poses, which the film does not show."""
-
-    def close(self) -> None:
-        """Write what waits and finish the film; a second call does nothing."""
-        if not self._is_open:
-            return
-        self._is_open = False
+    def _complete(self) -> None:
+        """Write what waits and finish the film."""
         try:
             while self._waiting:
                 self._waiting.popleft().result()
         finally:
             self._worker.shutdown(cancel_futures=True)
             self._sink.close()
-
-    def __exit__(self, *exception: object) -> None:
-        """Close it."""
-        self.close()
 
     def _put(self, item: _Item) -> None:
         if len(self._waiting) == _N_WAITING:

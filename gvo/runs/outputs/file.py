@@ -1,0 +1,51 @@
+"""What all files have in common that a run writes as it goes."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from contextlib import AbstractContextManager
+
+from gvo.types import Estimate, FaultyFrame, Frame, FrameResult, Optimum
+
+
+class FileOutput(AbstractContextManager["FileOutput"], ABC):
+    """A file of a run, open inside a `with` block; all poses are of the base frame.
+
+    It is written under another name in the same folder and takes its own when it is closed, also
+    where the run is interrupted. Without a single frame no file is left.
+
+    Raises
+    ------
+    RecordingError
+        By all methods, when the file cannot be written.
+    """
+
+    _is_open = True
+
+    @abstractmethod
+    def add_frame(self, frame: Frame, result: FrameResult) -> None:
+        """Write the result of a frame."""
+
+    def add_faulty(self, frame: FaultyFrame) -> None:
+        """Write that a frame has no pose."""
+
+    def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
+        """Write smoothed poses that are final, in any order."""
+
+    def add_optimum(self, optimum: Optimum) -> None:
+        """Write the global poses, and the loops that count."""
+
+    def close(self) -> None:
+        """Complete the file; a second call does nothing."""
+        if self._is_open:
+            self._is_open = False
+            self._complete()
+
+    @abstractmethod
+    def _complete(self) -> None:
+        """Write the last lines, and give the file its name."""
+
+    def __exit__(self, *exception: object) -> None:
+        """Close it."""
+        self.close()
