@@ -51,13 +51,6 @@ def test_where_nothing_associates_both_ranges_are_named() -> None:
     assert "within 10 ms" in message
 
 
-def test_an_empty_trajectory_is_named() -> None:
-    with pytest.raises(TrajectoryError, match="raw holds no poses"):
-        associate(still([0]), still([0]).select(slice(0, 0)), name="raw")
-    with pytest.raises(TrajectoryError, match="the reference holds no poses"):
-        associate(still([0]).select(slice(0, 0)), still([0]))
-
-
 @pytest.mark.parametrize(
     "origins", [("rows", "rows"), ("times", "rows"), ("rows", "times")], ids="-".join
 )
@@ -108,9 +101,8 @@ def test_the_first_pose_lies_on_the_first_after_alignment_of_the_origin(seed: in
 
 
 @pytest.mark.parametrize(("mode", "is_scaled"), [("se3", False), ("sim3", True)])
-@pytest.mark.parametrize("seed", range(2))
-def test_an_optimiser_has_no_better_alignment(seed: int, mode: AlignMode, is_scaled: bool) -> None:
-    reference, estimate = random_trajectory(seed), random_trajectory(seed + 100)
+def test_an_optimiser_has_no_better_alignment(mode: AlignMode, is_scaled: bool) -> None:
+    reference, estimate = random_trajectory(0), random_trajectory(100)
     aligned = alignment(reference, estimate, mode).apply(estimate)
     cost = np.sum((aligned.positions - reference.positions) ** 2)
 
@@ -119,19 +111,9 @@ def test_an_optimiser_has_no_better_alignment(seed: int, mode: AlignMode, is_sca
         scale = np.exp(x[6]) if is_scaled else 1.0
         return np.ravel(scale * estimate.positions @ R.T + x[3:6] - reference.positions)
 
-    starts = np.random.default_rng(seed).normal(size=(8, 7)) * [2, 2, 2, 1, 1, 1, 0.3]
+    starts = np.random.default_rng(0).normal(size=(8, 7)) * [2, 2, 2, 1, 1, 1, 0.3]
     best = min(2.0 * least_squares(residuals, start).cost for start in starts)
     assert cost == pytest.approx(best, rel=1e-6)
-
-
-def test_mirrored_points_are_aligned_by_a_rotation() -> None:
-    reference = random_trajectory(3)
-    mirrored = reference.T_world_frame.copy()
-    mirrored[:, 0, 3] *= -1.0
-    estimate = Trajectory(stamps_ns=reference.stamps_ns, T_world_frame=mirrored)
-    for mode in ("se3", "sim3"):
-        found = alignment(reference, estimate, mode)
-        assert np.linalg.det(found.T_a_b[:3, :3]) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(
@@ -160,12 +142,6 @@ def test_wrong_use_of_alignment_is_refused() -> None:
         alignment(still([0, 1, 2]), still([0, 1]), "se3")
     with pytest.raises(ValueError, match="mode must be one of"):
         alignment(still([0]), still([0]), "affine")  # type: ignore[arg-type]
-
-
-def test_no_alignment_moves_nothing() -> None:
-    trajectory = random_trajectory(0)
-    same = alignment(random_trajectory(1), trajectory, "none").apply(trajectory)
-    np.testing.assert_array_equal(same.T_world_frame, trajectory.T_world_frame)
 
 
 def test_covariances_scale_with_the_positions() -> None:
@@ -221,13 +197,6 @@ def test_nothing_is_interpolated_over_a_gap_or_outside() -> None:
     stamps_ns = np.array([-step, 0, step // 2, step + 5, 2 * step + 1, 3 * step - 9, 9 * step])
     found, _ = pair(dense, circle(stamps_ns))
     assert found.stamps_ns.tolist() == [0, step // 2, 2 * step + 1, 3 * step - 9]
-
-
-def test_equal_stamps_give_the_very_poses() -> None:
-    trajectory = circle(np.array([0, 7, 11, 3 * MAX_GAP_NS]))
-    first, second = pair(trajectory, circle(trajectory.stamps_ns, "file"))
-    np.testing.assert_allclose(first.T_world_frame, second.T_world_frame, rtol=0.0, atol=1e-12)
-    assert len(first) == 4
 
 
 def test_files_are_associated_as_ever_and_single_poses_as_well() -> None:

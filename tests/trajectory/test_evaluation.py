@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 import zipfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +20,13 @@ from gvo.trajectory.evaluation import (
     Evaluation,
     evaluate,
     relative_errors,
-    segment_errors,
     truth_jump,
 )
 from gvo.trajectory.formats import read_trajectory, write_kitti, write_tum
 from gvo.trajectory.trajectory import Trajectory
 from tests.trajectory.paths import seeds, straight, unturned
+
+ALIGNED: tuple[AlignMode, ...] = ("se3", "sim3")
 
 
 def drive(n: int, step_m: float = 1.0, *, seed: int = 0) -> Trajectory:
@@ -74,27 +74,6 @@ def run_evo(folder: Path, *arguments: str | Path) -> float:
         return float(json.loads(archive.read("stats.json"))["rmse"])
 
 
-def assert_as_evo(
-    evaluation: Evaluation, kind: str, files: Sequence[Path], ape: Sequence[str], rpe: Sequence[str]
-) -> None:
-    """Compare with what the programs of evo say of a reference and an estimate."""
-    folder = files[1].parent
-    expected = [
-        run_evo(folder, "evo_ape", kind, *files, *ape),
-        run_evo(folder, "evo_rpe", kind, *files, *rpe),
-        run_evo(folder, "evo_rpe", kind, *files, *rpe, "-r", "angle_deg"),
-    ]
-    found = [evaluation.ate_m, evaluation.rpe_m, evaluation.rpe_deg]
-    assert found == pytest.approx(expected, abs=1e-6)
-
-
-def without_ties(reference: Trajectory, estimate: Trajectory) -> Trajectory:
-    """Return the poses that are not midway between two others: evo decides those by rounding."""
-    after = np.clip(np.searchsorted(reference.stamps_ns, estimate.stamps_ns), 1, len(reference) - 1)
-    both = reference.stamps_ns[after] + reference.stamps_ns[after - 1]
-    return estimate.select(both != 2 * estimate.stamps_ns)
-
-
 def devkit_errors(
     T_ref: np.ndarray, T_est: np.ndarray, lengths: list[float], step: int
 ) -> tuple[float, float]:
@@ -138,14 +117,6 @@ def test_segment_errors_are_those_of_the_devkit(
     assert evaluation.segments_m == tuple(lengths)
 
 
-def test_a_segment_ends_at_the_first_pose_beyond_its_length() -> None:
-    # 20 m are reached by pose 20, passed by pose 21: 22 poses hold one segment, 21 none
-    lengths = {"lengths_m": [20.0], "step": 1}
-    for n, expected in [(21, 0), (22, 1), (24, 3)]:
-        shares, _ = segment_errors(straight(n, 1.0), straight(n, 1.0), **lengths)  # type: ignore[arg-type]
-        assert len(shares) == expected
-
-
 @given(seeds)
 def test_a_trajectory_has_no_error_against_itself_wherever_it_lies(seed: int) -> None:
     reference = drive(80, seed=seed)
@@ -154,16 +125,6 @@ def test_a_trajectory_has_no_error_against_itself_wherever_it_lies(seed: int) ->
     np.testing.assert_allclose(np.array(measures(evaluation), dtype=float), 0.0, atol=1e-5)
     assert (evaluation.n, evaluation.reference_share) == (80, 1.0)
     assert evaluation.path_ratio == pytest.approx(1.0)
-
-
-@given(seeds)
-def test_the_errors_do_not_depend_on_the_world_of_the_estimate(seed: int) -> None:
-    reference = drive(80)
-    estimate = disturbed(reference, seed=seed)
-    T = se3.exp(np.random.default_rng(seed).normal(size=6) * [1, 1, 1, 50, 50, 50])
-    here = evaluate(reference, estimate, name="here")
-    there = evaluate(reference, Similarity(T_a_b=T).apply(estimate), name="there")
-    assert measures(there) == pytest.approx(measures(here), rel=1e-6)
 
 
 def test_a_wrong_scale_is_measured_and_taken_out_by_sim3() -> None:
@@ -189,32 +150,11 @@ def test_steps_that_are_too_long_give_their_share_on_a_straight_drive() -> None:
     assert evaluation.ate_max_m == pytest.approx(1.0)
 
 
-def test_a_pair_of_the_rpe_spans_delta_poses() -> None:
-    errors, turns = relative_errors(straight(10, 1.0), straight(10, 1.1), delta=4)
-    np.testing.assert_allclose(errors, [0.4] * 6, atol=1e-12)
-    np.testing.assert_array_equal(turns, [0.0] * 6)
-    np.testing.assert_allclose(relative_errors(straight(10, 1.0), straight(10, 1.1))[0], [0.1] * 9)
-
-
-def test_the_segments_of_kitti_are_for_paths_as_long_as_the_longest_of_them() -> None:
-    for n, lengths, n_starts in [
-        (801, tuple(100.0 * k for k in range(1, 9)), 81),
-        (800, (20.0, 50.0), 800),
-    ]:
-        evaluation = evaluate(straight(n, 1.0), straight(n, 1.0), name="e")
-        assert evaluation.segments_m == lengths
-        starts = range(0, n, 10 if n_starts == 81 else 1)
-        fitting = [sum(start + length + 1 < n for start in starts) for length in lengths]
-        assert evaluation.n_segments == sum(fitting)
-
-
 @pytest.mark.parametrize(
     ("reference_m", "estimate_m", "ratio"),
     [
         (10.0, 0.0, 0.0),
-        (0.0, 10.0, None),
         (2e-6, 1e-6, 0.5),
-        (0.9e-6, 1e-6, None),
         (1e-6, 1e-6, None),  # a path of a micrometre is no motion
         (1.001e-6, 1.001e-6, 1.0),
     ],
@@ -239,11 +179,10 @@ def test_what_cannot_be_measured_is_none() -> None:
     assert evaluate(straight(20, 1.0), straight(20, 1.0), name="short").t_pct is None
 
 
-@pytest.mark.parametrize("align", ["none", "origin", "se3", "sim3"])
+@pytest.mark.parametrize("align", ["none", "se3"])
 def test_fewer_than_three_poses_in_common_measure_nothing(align: AlignMode) -> None:
-    for n in (1, 2):
-        with pytest.raises(TrajectoryError, match=rf"^few and .*: {n}, expected at least 3$"):
-            evaluate(straight(30, 1.0), straight(n, 1.0), name="few", align=align)
+    with pytest.raises(TrajectoryError, match=r"^few and .*: 2, expected at least 3$"):
+        evaluate(straight(30, 1.0), straight(2, 1.0), name="few", align=align)
     assert evaluate(straight(30, 1.0), straight(3, 1.0), name="few", align=align).n == 3
 
 
@@ -278,71 +217,37 @@ def test_stamps_may_differ_by_what_is_allowed_and_no_more() -> None:
         evaluate(reference, late, name="late", max_difference_ns=11_999_999)
 
 
-def test_segments_of_less_than_a_metre_and_a_single_one_are_measured() -> None:
-    reference, estimate = straight(4, 0.25), straight(4, 0.3)
-    # Half a metre is passed by the third step: one start, an error of three times 5 cm.
-    shares, turns = segment_errors(reference, estimate, lengths_m=[0.5], step=1)
-    np.testing.assert_allclose(shares, [0.15 / 0.5])
-    np.testing.assert_allclose(turns, [0.0], atol=1e-12)
-    found = evaluate(reference, estimate, name="e", segments=[0.5], segment_step=1, align="origin")
-    assert found.n_segments == 1
-    assert found.t_pct == pytest.approx(30.0)
-    assert found.r_deg_per_100m == pytest.approx(0.0, abs=1e-9)
-    three = evaluate(straight(3, 1.0), straight(3, 1.2), name="e", align="none")
-    assert three.rpe_m == pytest.approx(0.2)
-    assert three.rpe_deg == pytest.approx(0.0, abs=1e-9)
-    with pytest.raises(ValueError, match="got 1 and"):
-        segment_errors(reference, estimate, lengths_m=[0.5, 0.0], step=1)
-
-
 def test_pairs_as_far_apart_as_the_trajectory_is_long_are_none() -> None:
     for delta, n_pairs in ((1, 4), (4, 1), (5, 0), (9, 0)):
         errors, turns = relative_errors(straight(5, 1.0), straight(5, 1.1), delta=delta)
-        assert len(errors) == len(turns) == n_pairs
+        np.testing.assert_allclose(errors, [0.1 * delta] * n_pairs, atol=1e-12)
+        np.testing.assert_array_equal(turns, [0.0] * n_pairs)
     assert evaluate(straight(5, 1.0), straight(5, 1.1), name="e", rpe_delta=5).rpe_m is None
 
 
-@pytest.mark.parametrize(("align", "option"), [("se3", "-a"), ("sim3", "-as")])
-def test_ate_and_rpe_are_of_evo_on_tum_files(tmp_path: Path, align: AlignMode, option: str) -> None:
+def test_ate_and_rpe_are_those_of_evo(tmp_path: Path) -> None:
     reference = drive(200)
-    estimate = disturbed(reference).select(np.arange(5, 200, 3))
-    shifted = Trajectory(
-        stamps_ns=estimate.stamps_ns + 3_000_000, T_world_frame=estimate.T_world_frame
+    estimate = disturbed(reference)
+    late = estimate.select(np.arange(5, 200, 3))
+    late = Trajectory(stamps_ns=late.stamps_ns + 3_000_000, T_world_frame=late.T_world_frame)
+    tum = tmp_path / "reference.txt", tmp_path / "estimate.txt"
+    kitti = tmp_path / "reference_rows.txt", tmp_path / "estimate_rows.txt"
+    write_tum(tum[0], reference)
+    write_tum(tum[1], late)
+    write_kitti(kitti[0], reference)
+    write_kitti(kitti[1], estimate)
+    rigid, scaled = (
+        evaluate(*map(read_trajectory, tum), name="e", align=align) for align in ALIGNED
     )
-    files = tmp_path / "reference.txt", tmp_path / "estimate.txt"
-    write_tum(files[0], reference)
-    write_tum(files[1], shifted)
-    evaluation = evaluate(*map(read_trajectory, files), name="e", align=align)
-    assert_as_evo(evaluation, "tum", files, [option], ["-d", "1", "-u", "f", option])
-
-
-def test_ate_and_rpe_are_of_evo_on_kitti_files(tmp_path: Path) -> None:
-    reference = drive(150)
-    files = tmp_path / "reference.txt", tmp_path / "estimate.txt"
-    write_kitti(files[0], reference)
-    write_kitti(files[1], disturbed(reference))
-    evaluation = evaluate(*map(read_trajectory, files), name="e", align="origin", rpe_delta=3)
-    rpe = ["--align_origin", "-d", "3", "-u", "f", "--all_pairs"]
-    assert_as_evo(evaluation, "kitti", files, rpe[:1], rpe)
-
-
-@pytest.mark.recorded
-@pytest.mark.acceptance
-@pytest.mark.parametrize(
-    ("reference", "estimate", "kind"),
-    [("KITTI_00_gt", "KITTI_00_ORB", "kitti"), ("fr2_desk_groundtruth", "fr2_desk_ORB", "tum")],
-)
-def test_ate_and_rpe_of_published_trajectories_are_those_of_evo(
-    gvo_data: Path, tmp_path: Path, reference: str, estimate: str, kind: str
-) -> None:
-    truth, found = (gvo_data / "trajectories" / f"{name}.txt" for name in (reference, estimate))
-    kept = read_trajectory(found)
-    if kind == "tum":
-        kept = without_ties(read_trajectory(truth), kept)
-    files = truth, tmp_path / "estimate.txt"
-    (write_tum if kind == "tum" else write_kitti)(files[1], kept)
-    evaluation = evaluate(*map(read_trajectory, files), name=estimate)
-    assert_as_evo(evaluation, kind, files, ["-a"], [])
+    rows = evaluate(*map(read_trajectory, kitti), name="e", align="origin", rpe_delta=3)
+    pairs = ["--align_origin", "-d", "3", "-u", "f", "--all_pairs"]
+    for found, program in [
+        (rigid.ate_m, ["evo_ape", "tum", *tum, "-a"]),
+        (scaled.rpe_m, ["evo_rpe", "tum", *tum, "-as", "-d", "1", "-u", "f"]),
+        (rows.ate_m, ["evo_ape", "kitti", *kitti, "--align_origin"]),
+        (rows.rpe_deg, ["evo_rpe", "kitti", *kitti, *pairs, "-r", "angle_deg"]),
+    ]:
+        assert found == pytest.approx(run_evo(tmp_path, *program), abs=1e-6)
 
 
 @pytest.mark.recorded
@@ -412,15 +317,6 @@ def test_the_jump_of_the_truth_is_its_own_noise_and_not_that_of_the_estimate(
     jump_m = truth_jump(shaken(), estimate)
     assert jump_m is not None
     assert jump_m < 1e-3
-
-
-def test_a_truth_does_not_jump_where_the_estimate_is_lost() -> None:
-    truth = shaken()
-    poses = np.concatenate(
-        [truth.T_world_frame[:220], np.tile(truth.T_world_frame[219], (80, 1, 1))]
-    )
-    estimate = Trajectory(stamps_ns=truth.stamps_ns, T_world_frame=poses)
-    assert truth_jump(truth, estimate) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_the_jump_of_the_truth_needs_three_poses_with_rotations() -> None:

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from gvo.geometry import se3
 from gvo.trajectory.trajectory import Trajectory, format_stamp
 from gvo.types import FloatArray
-from tests.results import estimate_at
 from tests.trajectory.paths import random_trajectory, seeds, still, unturned
 
 
@@ -79,23 +78,6 @@ def test_a_stamp_is_written_without_loss(stamp_ns: int) -> None:
     assert len(text.partition(".")[2]) == 9
 
 
-def test_distances_add_up_the_steps() -> None:
-    poses = unturned(np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0], [3.0, 4.0, 2.0]]))
-    trajectory = Trajectory(stamps_ns=np.arange(3), T_world_frame=poses)
-    assert trajectory.distances().tolist() == [0.0, 5.0, 7.0]
-
-
-@given(seeds)
-def test_changing_the_frame_back_and_forth_changes_nothing(seed: int) -> None:
-    trajectory = random_trajectory(seed)
-    T_cam_body = se3.exp(np.random.default_rng(seed + 1).normal(size=6))
-    back = trajectory.transformed(T_cam_body).transformed(se3.invert(T_cam_body))
-    assert trajectory.covariances is not None
-    assert back.covariances is not None
-    np.testing.assert_allclose(back.T_world_frame, trajectory.T_world_frame, atol=1e-12)
-    np.testing.assert_allclose(back.covariances, trajectory.covariances, atol=1e-9, rtol=1e-7)
-
-
 def test_the_covariance_of_another_frame_is_that_of_moved_samples() -> None:
     rng = np.random.default_rng(5)
     covariance = np.diag([1.0, 4.0, 9.0, 2.0, 3.0, 5.0]) * 1e-6
@@ -108,14 +90,6 @@ def test_the_covariance_of_another_frame_is_that_of_moved_samples() -> None:
     ).transformed(T_cam_body)
     assert trajectory.covariances is not None
     np.testing.assert_allclose(trajectory.covariances[0], np.cov(twists.T), atol=6e-7)
-
-
-@given(seeds)
-def test_interpolating_at_the_stamps_returns_the_poses(seed: int) -> None:
-    trajectory = random_trajectory(seed)
-    same = trajectory.interpolate(trajectory.stamps_ns)
-    np.testing.assert_array_equal(same.stamps_ns, trajectory.stamps_ns)
-    np.testing.assert_allclose(same.T_world_frame, trajectory.T_world_frame, atol=1e-9)
 
 
 @given(seeds, st.floats(min_value=0.0, max_value=1.0))
@@ -145,31 +119,6 @@ def test_nothing_is_extrapolated() -> None:
     inside = trajectory.interpolate(np.array([first - 1, first, first + 1, last, last + 1]))
     assert inside.stamps_ns.tolist() == [first, first + 1, last]
     assert len(trajectory.interpolate(np.array([last + 1]))) == 0
-
-
-def test_selecting_keeps_stamps_poses_and_covariances_together() -> None:
-    trajectory = random_trajectory(1)
-    chosen = trajectory.select([2, 5])
-    assert trajectory.covariances is not None
-    assert chosen.covariances is not None
-    np.testing.assert_array_equal(chosen.stamps_ns, trajectory.stamps_ns[[2, 5]])
-    np.testing.assert_array_equal(chosen.T_world_frame, trajectory.T_world_frame[[2, 5]])
-    np.testing.assert_array_equal(chosen.covariances, trajectory.covariances[[2, 5]])
-    assert len(trajectory.select(trajectory.stamps_ns > trajectory.stamps_ns[8])) == 3
-
-
-def test_estimates_in_any_order_become_a_trajectory_with_covariances() -> None:
-    rng = np.random.default_rng(2)
-    estimates = [
-        estimate_at(stamp_ns, se3.exp(rng.normal(size=6)), covariance=stamp_ns * np.eye(6))
-        for stamp_ns in (30, 10, 20)
-    ]
-    collected = Trajectory.of(estimates)
-    assert collected.stamps_ns.tolist() == [10, 20, 30]
-    np.testing.assert_array_equal(collected.T_world_frame[2], estimates[0].T_world_frame)
-    assert collected.covariances is not None
-    np.testing.assert_array_equal(collected.covariances[1], 20.0 * np.eye(6))
-    assert len(Trajectory.of([])) == 0
 
 
 def positions_only(seed: int = 0, n: int = 5) -> Trajectory:
