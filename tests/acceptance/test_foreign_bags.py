@@ -9,17 +9,12 @@ from tests.conftest import Command
 pytestmark = [pytest.mark.acceptance, pytest.mark.recorded]
 
 COMMANDS = (
-    ("check", "{}"),
     ("check", "{}", "--json"),
     ("run", "{}", "--no-report", "--duration", "1", "--bag", "o.mcap"),
     ("convert", "{}", "c.mcap"),
-    ("convert", "{}", "folder", "--layout", "tum"),
     ("explain", "{}", "--frame", "0"),
     ("smooth", "{}"),
-    ("compare", "{}", "{}"),
     ("compare", "{}#tf:a:b", "{}"),
-    ("view", "{}/nothing", "--port", "0"),
-    ("config", "--config", "{}"),
 )
 
 

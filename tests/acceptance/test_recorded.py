@@ -16,8 +16,7 @@ EUROC = "euroc_mh01_start"
 pytestmark = [pytest.mark.recorded, pytest.mark.acceptance]
 
 
-@pytest.mark.parametrize("name", [KITTI, XYZ, EUROC])
-@pytest.mark.parametrize("suffix", [".bag", ".mcap", ""])
+@pytest.mark.parametrize(("name", "suffix"), [(KITTI, ".bag"), (XYZ, ".mcap"), (EUROC, "")])
 def test_folder_and_bag_give_the_same_frames_and_cameras(
     gvo_data: Path, tmp_path: Path, name: str, suffix: str
 ) -> None:

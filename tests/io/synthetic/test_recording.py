@@ -111,15 +111,6 @@ def test_the_right_image_moved_by_the_exact_disparity_is_the_left_image(world: s
     assert shifted.mean() > 2.0 * differences.mean()
 
 
-@pytest.mark.parametrize("world", WORLDS)
-def test_disparities_are_unbiased_to_a_few_hundredths_of_a_pixel(world: str) -> None:
-    recording = perfect(world, n_frames=30, scale=1.0)
-    shifts = residual_disparities(*right_seen_from_left(recording, 12))
-    assert len(shifts) > 20_000
-    assert abs(np.median(shifts)) < 0.01
-    assert abs(np.mean(shifts)) < 0.02
-
-
 @pytest.mark.parametrize("offset", [-0.5, 0.4])
 def test_a_planted_offset_makes_every_disparity_larger(offset: float) -> None:
     noise = replace(PERFECT, disparity_offset_px=offset)
@@ -169,36 +160,11 @@ def test_a_recording_announces_what_it_yields(world: Any, sensor: Any) -> None:
     np.testing.assert_array_equal(truth.stamps_ns, [image.stamp_ns for image in images[::2]])
 
 
-def test_a_smaller_image_is_the_larger_one_averaged() -> None:
-    large = load(perfect("handheld", n_frames=1, scale=1.0), 0).astype(np.float64)
-    small = load(perfect("handheld", n_frames=1, scale=0.5), 0).astype(np.float64)
-    averaged = np.asarray(cv2.resize(large, small.shape[::-1], interpolation=cv2.INTER_AREA))
-    everywhere = np.ones(small.shape, dtype=np.bool_)
-    assert np.abs(averaged - small).mean() < 4.0
-    for a, b in ((averaged, small), (averaged.T, small.T)):
-        shifts = residual_disparities(
-            np.ascontiguousarray(a), np.ascontiguousarray(b), everywhere.reshape(a.shape)
-        )
-        assert abs(np.mean(shifts)) < 0.03
-
-
 def test_the_kitti_camera_is_rendered_at_full_scale() -> None:
     camera = stereo_camera_of(SyntheticRecording("driving", n_frames=1))
     assert (camera.width, camera.height) == (1226, 370)
     assert (camera.fx, camera.cx, camera.cy) == (707.0912, 601.8873, 183.1104)
     assert camera.baseline == pytest.approx(0.53715)
-
-
-@pytest.mark.parametrize("world", WORLDS)
-def test_corners_are_spread_over_the_image(world: Any) -> None:
-    image = load(SyntheticRecording(world, n_frames=1), 0)
-    corners = cv2.FastFeatureDetector.create(15).detect(image)
-    assert len(corners) > 1000
-    points = np.array([corner.pt for corner in corners])
-    counts, *_ = np.histogram2d(
-        points[:, 1], points[:, 0], bins=(3, 4), range=((0, image.shape[0]), (0, image.shape[1]))
-    )
-    assert np.count_nonzero(counts >= 25) >= 11
 
 
 @pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
@@ -210,11 +176,6 @@ def test_the_same_seed_gives_the_same_bytes_in_any_order_and_thread(sensor: Any)
         loaded = list(pool.map(lambda image: image.load().tobytes(), again[7::-1]))
     assert loaded[::-1] == expected
     assert len(set(expected)) == 8
-
-
-def test_another_seed_gives_another_scene() -> None:
-    images = [load(perfect("handheld", n_frames=1, seed=seed, scale=0.3), 0) for seed in (0, 3)]
-    assert np.abs(np.subtract(*images, dtype=np.float64)).mean() > 3.0
 
 
 def test_image_noise_has_the_announced_spread_and_differs_between_images() -> None:
@@ -298,20 +259,13 @@ def test_depth_is_unknown_out_of_range_in_blobs_and_at_steps() -> None:
     assert not np.any(edges[:, 10:150])
 
 
-def test_sloping_planes_are_no_steps() -> None:
-    recording = perfect("handheld", "rgbd", n_frames=1, noise=replace(PERFECT, edge_radius_px=1))
-    assert np.isnan(load(recording, 0, 1)).mean() < 0.2
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"world": "moon"}, "world must be one of"),
-        ({"sensor": "lidar"}, "sensor must be one of"),
         ({"n_frames": 0}, "n_frames must be positive"),
         ({"seed": -1}, "seed not negative"),
         ({"scale": 0.0}, "scale must be in"),
-        ({"scale": float("nan")}, "scale must be in"),
     ],
 )
 def test_a_recording_nobody_can_render_is_refused(options: dict[str, Any], message: str) -> None:

