@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from gvo.errors import RecordingError
-from gvo.geometry.camera import Calibration
 from gvo.io.recording import RecordingInfo, Source
 from gvo.testing.faults import Fault, FaultyImage, Pixels
 
@@ -165,141 +165,63 @@ class Unloadable(Fault):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StampFault(Fault):
-    """A wrong stamp; a subclass overrides `restamp`. The clock of the recording is right."""
+class Restamped(Fault):
+    """Stamps changed by a function of them and the first one; that of the recording is right."""
+
+    by: Callable[[int, int], int]
 
     def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
         start_ns: int | None = None
         for image in images:
-            start_ns = image.given.stamp_ns if start_ns is None else start_ns
+            given = image.given
+            start_ns = given.stamp_ns if start_ns is None else start_ns
             if self.applies_to(image):
-                stamp_ns = self.restamp(image, start_ns)
-                image = replace(image, given=replace(image.given, stamp_ns=stamp_ns))
-            yield image
-
-    def restamp(self, image: FaultyImage, start_ns: int) -> int:
-        return image.given.stamp_ns
+                given = replace(given, stamp_ns=self.by(given.stamp_ns, start_ns))
+            yield replace(image, given=given)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StampShift(StampFault):
-    """A clock that is set to another time, or an offset between two clocks."""
-
-    by_s: float = 3600.0
-
-    def restamp(self, image: FaultyImage, start_ns: int) -> int:
-        return image.given.stamp_ns + round(self.by_s * 1e9)
+def stamps_moved(by_s: float, **options: Any) -> Restamped:
+    """Return a clock that is set to another time, or an offset between two clocks."""
+    by_ns = round(by_s * 1e9)
+    return Restamped(by=lambda stamp_ns, _: stamp_ns + by_ns, **options)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StampConstant(StampFault):
-    """A driver that does not stamp: all images have the same stamp."""
+def stamps_of_arrival(sigma_s: float, **options: Any) -> Restamped:
+    """Return stamps that are off at random."""
 
-    stamp_ns: int | None = 0
+    def restamp(stamp_ns: int, _: int) -> int:
+        error = float(np.random.default_rng(stamp_ns % 10**9).standard_normal())
+        return stamp_ns + round(1e9 * sigma_s * min(max(error, -3.0), 3.0))
 
-    def restamp(self, image: FaultyImage, start_ns: int) -> int:
-        return start_ns if self.stamp_ns is None else self.stamp_ns
+    return Restamped(by=restamp, **options)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StampFromZero(StampFault):
-    """A clock that starts with the recording: the first stamp is 0."""
+class Miscalibrated(Fault):
+    """K and P times a factor each, for the whole recording."""
 
-    def restamp(self, image: FaultyImage, start_ns: int) -> int:
-        return image.given.stamp_ns - start_ns
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StampBackwards(StampFault):
-    """A clock that runs backwards."""
-
-    def restamp(self, image: FaultyImage, start_ns: int) -> int:
-        return 2 * start_ns - image.given.stamp_ns
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StampRate(StampFault):
-    """A clock that drifts."""
-
-    rate: float = 1.001
-
-    def restamp(self, image: FaultyImage, start_ns: int) -> int:
-        return start_ns + round(self.rate * (image.given.stamp_ns - start_ns))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StampUnit(StampFault):
-    """Stamps in another unit, taken for nanoseconds."""
-
-    unit_ns: int = 1_000_000_000
-
-    def restamp(self, image: FaultyImage, start_ns: int) -> int:
-        return image.given.stamp_ns // self.unit_ns
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StampJitter(StampFault):
-    """Stamps of the arrival, not of the exposure."""
-
-    sigma_s: float = 0.01
-    is_shared: bool = True
-
-    def restamp(self, image: FaultyImage, start_ns: int) -> int:
-        given = replace(image.given, stream=0) if self.is_shared else image.given
-        error = float(self.rng(replace(image, given=given)).standard_normal())
-        error = math.copysign(min(abs(error), 3.0), error)
-        return image.given.stamp_ns + round(1e9 * self.sigma_s * error)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CalibrationFault(Fault):
-    """A wrong calibration, for the whole recording."""
+    K: ArrayLike = 1.0
+    P: ArrayLike = 1.0
 
     def change_info(self, info: RecordingInfo) -> RecordingInfo:
         calibrations = tuple(
-            self.miscalibrate(calibration) if stream in self.streams else calibration
-            for stream, calibration in enumerate(info.calibrations)
+            replace(each, K=each.K * self.K, P=each.P * self.P) if stream in self.streams else each
+            for stream, each in enumerate(info.calibrations)
         )
         return replace(info, calibrations=calibrations)
 
-    def miscalibrate(self, calibration: Calibration) -> Calibration:
-        return calibration
+
+def wrong_baseline(factor: float) -> Miscalibrated:
+    return Miscalibrated(P=np.array([[1.0, 1.0, 1.0, factor]]))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WrongBaseline(CalibrationFault):
-    """A baseline in another unit, or of another rig."""
-
-    factor: float = 2.0
-
-    def miscalibrate(self, calibration: Calibration) -> Calibration:
-        P = calibration.P.copy()
-        P[:, 3] *= self.factor
-        return replace(calibration, P=P)
+def wrong_focal_length(factor: float, **options: Any) -> Miscalibrated:
+    """Return the calibration of another lens; the baseline stays right."""
+    K = np.array([[factor, factor, 1.0], [factor, factor, 1.0], [1.0, 1.0, 1.0]])
+    P = np.array([[factor, factor, 1.0, factor], [factor, factor, 1.0, factor], [1.0] * 4])
+    return Miscalibrated(K=K, P=P, **options)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WrongFocalLength(CalibrationFault):
-    """The focal length of another lens; the baseline stays right."""
-
-    factor: float = 1.3
-
-    def miscalibrate(self, calibration: Calibration) -> Calibration:
-        K, P = calibration.K.copy(), calibration.P.copy()
-        K[:2, :2] *= self.factor
-        P[:2, [0, 1, 3]] *= self.factor
-        return replace(calibration, K=K, P=P)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WrongPrincipalPoint(CalibrationFault):
-    """The principal point of another camera; off by shares of width and height."""
-
-    by: tuple[float, float] = (0.1, 0.1)
-
-    def miscalibrate(self, calibration: Calibration) -> Calibration:
-        K, P = calibration.K.copy(), calibration.P.copy()
-        shift = np.array([self.by[0] * calibration.width, self.by[1] * calibration.height])
-        K[:2, 2] += shift
-        P[:2, 2] += shift
-        return replace(calibration, K=K, P=P)
+def wrong_principal_point(factor: float) -> Miscalibrated:
+    K = np.array([[1.0, 1.0, factor], [1.0, 1.0, factor], [1.0, 1.0, 1.0]])
+    return Miscalibrated(K=K, P=np.column_stack([K, np.ones(3)]))

@@ -1,319 +1,165 @@
-"""Faults of light, lens, depth and transfer."""
+"""Faults of light, lens, depth and transfer: each a function of pixels and the image's numbers."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import partial
+from typing import Any, Literal, TypeAlias
 
 import cv2
 import numpy as np
 
-from gvo.testing.faults import FaultyImage, PixelFault, Pixels
+from gvo.testing.faults import Fault, FaultyImage, PixelFault, Pixels
 
 _WHITE = 255
-Turn: TypeAlias = Literal["upside down", "mirrored", "half turn", "transposed"]
-PixelType: TypeAlias = Literal["float64", "float32", "uint16", "int32", "bool", "colour", "flat"]
+Rng: TypeAlias = np.random.Generator
+Part: TypeAlias = Literal["light", "depth", "all"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class White(PixelFault):
-    """Saturated images: the sun, the end of a tunnel."""
+class Spoilt(PixelFault):
+    """Pixels changed by a function of them, the number of the frame, and random numbers."""
 
-    part: float = 1.0
+    by: Callable[[Pixels, int, Rng], Pixels]
+    of: Part = "light"
 
-    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
-        spoilt = pixels.copy()
-        spoilt[:, : round(self.part * pixels.shape[1])] = _WHITE
-        return spoilt
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Blurred(PixelFault):
-    """Images out of focus."""
-
-    sigma_px: float = 4.0
+    def is_possible(self, is_depth: bool) -> bool:
+        return self.of == "all" or is_depth == (self.of == "depth")
 
     def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
-        return np.asarray(cv2.GaussianBlur(pixels, (0, 0), self.sigma_px))
+        return self.by(pixels, image.frame, self.rng(image))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MotionBlurred(PixelFault):
-    """Images exposed for too long while the camera turns."""
-
-    length_px: int = 15
-
-    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
-        return np.asarray(cv2.blur(pixels, (self.length_px, 1)))
+def spoilt(by: Callable[..., Pixels], of: Part = "light", **values: Any) -> Spoilt:
+    """Return the fault of a function: the values are its own, or those that any fault has."""
+    names = [field.name for field in fields(Fault)]
+    options = {name: values.pop(name) for name in names if name in values}
+    return Spoilt(by=partial(by, **values), of=of, **options)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Noisy(PixelFault):
-    """Images with much noise: gain turned up at night."""
-
-    sigma: float = 40.0
-
-    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
-        rng = self.rng(image)
-        return _to_uint8(pixels + self.sigma * rng.standard_normal(pixels.shape))
+of_depth = partial(spoilt, of="depth")
+of_all = partial(spoilt, of="all")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SaltAndPepper(PixelFault):
-    """Single pixels white or black: bit errors, a damaged sensor."""
-
-    density: float = 0.1
-
-    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
-        rng = self.rng(image)
-        spoilt = pixels.copy()
-        chance = rng.random(pixels.shape[:2])
-        spoilt[chance < 0.5 * self.density] = 0
-        spoilt[chance > 1.0 - 0.5 * self.density] = _WHITE
-        return spoilt
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Exposed(PixelFault):
-    """Images brighter or darker than the others."""
-
-    factor: float = 2.0
-
-    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
-        return _to_uint8(self.factor * pixels.astype(np.float64))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Flickering(PixelFault):
-    """Brightness that oscillates from frame to frame, as under mains lamps."""
-
-    amplitude: float = 0.4
-    period: float = 3.3
-
-    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
-        swing = np.sin(2.0 * np.pi * image.frame / self.period)
-        return _to_uint8((1.0 + self.amplitude * swing) * pixels.astype(np.float64))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Banded(PixelFault):
-    """Bands that roll through the image: a rolling shutter under mains lamps."""
-
-    amplitude: float = 0.4
-    period_rows: float = 40.0
-    rows_per_frame: float = 7.0
-
-    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
-        rows = np.arange(pixels.shape[0]) + self.rows_per_frame * image.frame
-        gain = 1.0 + self.amplitude * np.sin(2.0 * np.pi * rows / self.period_rows)
-        gain = gain.reshape(-1, *[1] * (pixels.ndim - 1))
-        return _to_uint8(gain * pixels.astype(np.float64))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Covered(PixelFault):
-    """A drop, dirt or part of the robot in front of the lens: blobs that stay where they are."""
-
-    part: float = 0.25
-    n_blobs: int = 3
-
-    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
-        height, width = pixels.shape[:2]
-        fixed = np.random.default_rng([self.seed, image.given.stream])
-        radius = float(np.sqrt(self.part * height * width / (np.pi * self.n_blobs)))
-        dirt = fixed.integers(30, 120, (height, width)).astype(np.uint8)
-        dirt = np.asarray(cv2.GaussianBlur(dirt, (0, 0), 1.5))
-        spoilt = pixels.copy()
-        v, u = np.mgrid[:height, :width]
-        for centre_u, centre_v in fixed.random((self.n_blobs, 2)) * (width, height):
-            is_covered = (u - centre_u) ** 2 + (v - centre_v) ** 2 < radius**2
-            grey = dirt[is_covered]
-            spoilt[is_covered] = grey if pixels.ndim == 2 else grey[:, np.newaxis]
-        return spoilt
-
-
-def _to_uint8(values: Pixels) -> Pixels:
+def _grey(values: Pixels) -> Pixels:
     return np.asarray(np.clip(np.rint(values), 0, _WHITE), dtype=np.uint8)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DepthFault(PixelFault):
-    """A fault of depth images; grey and colour images stay as they are."""
-
-    def is_possible(self, is_depth: bool) -> bool:
-        return is_depth
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DepthConstant(DepthFault):
-    """Depth that is one value everywhere."""
-
-    depth_m: float = float("nan")
-
-    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
-        return np.full_like(pixels, self.depth_m)
+def white(pixels: Pixels, frame: int, rng: Rng, part: float = 1.0) -> Pixels:
+    """Saturate a part: the sun, the end of a tunnel."""
+    changed = pixels.copy()
+    changed[:, : round(part * pixels.shape[1])] = _WHITE
+    return changed
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DepthScaled(DepthFault):
-    """Depth in another unit."""
-
-    factor: float = 1000.0
-
-    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
-        return (self.factor * pixels).astype(pixels.dtype)
+def blurred(pixels: Pixels, frame: int, rng: Rng, sigma_px: float) -> Pixels:
+    return np.asarray(cv2.GaussianBlur(pixels, (0, 0), sigma_px))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DepthQuantized(DepthFault):
-    """Depth in coarse steps."""
-
-    step_m: float = 0.25
-
-    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
-        return (self.step_m * np.rint(pixels / self.step_m)).astype(pixels.dtype)
+def noisy(pixels: Pixels, frame: int, rng: Rng, sigma: float) -> Pixels:
+    return _grey(pixels + sigma * rng.standard_normal(pixels.shape))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DepthHoles(DepthFault):
-    """Depth that is unknown in most places: sunlight, dark or shiny surfaces."""
-
-    part: float = 0.9
-    size_px: int = 8
-
-    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
-        rng = self.rng(image)
-        height, width = pixels.shape[:2]
-        cells = rng.random((height // self.size_px + 1, width // self.size_px + 1))
-        is_hole = cells < self.part
-        spread = np.asarray(
-            cv2.resize(is_hole.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
-        )
-        spoilt = pixels.copy()
-        spoilt[spread > 0] = np.nan
-        return spoilt
+def exposed(pixels: Pixels, frame: int, rng: Rng, factor: float) -> Pixels:
+    return _grey(factor * pixels.astype(np.float64))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DepthSaturated(DepthFault):
-    """Depth that ends at the sensor's range, also at unknown pixels."""
-
-    depth_m: float = 2.0
-
-    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
-        return np.asarray(np.fmin(pixels, self.depth_m), dtype=pixels.dtype)
+def flickering(pixels: Pixels, frame: int, rng: Rng, amplitude: float) -> Pixels:
+    """Swing in brightness from frame to frame, as under mains lamps."""
+    return exposed(pixels, frame, rng, 1.0 + amplitude * np.sin(2.0 * np.pi * frame / 3.3))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DepthNoisy(DepthFault):
-    """Depth with much noise, growing with its square."""
-
-    sigma_m: float = 0.05
-
-    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
-        rng = self.rng(image)
-        noise = self.sigma_m * pixels**2 * rng.standard_normal(pixels.shape)
-        return (pixels + noise).astype(pixels.dtype)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _AnyImageFault(PixelFault):
-    """A fault of images of all kinds."""
-
-    def is_possible(self, is_depth: bool) -> bool:
-        return True
+def covered(pixels: Pixels, frame: int, rng: Rng) -> Pixels:
+    """Cover a quarter by three blobs that stay: drops, dirt, a part of the robot."""
+    height, width = pixels.shape[:2]
+    fixed = np.random.default_rng(0)
+    radius = float(np.sqrt(0.25 * height * width / (np.pi * 3)))
+    dirt = cv2.GaussianBlur(fixed.integers(30, 120, (height, width)).astype(np.uint8), (0, 0), 1.5)
+    changed = pixels.copy()
+    v, u = np.mgrid[:height, :width]
+    for centre_u, centre_v in fixed.random((3, 2)) * (width, height):
+        is_covered = (u - centre_u) ** 2 + (v - centre_v) ** 2 < radius**2
+        changed[is_covered] = np.asarray(dirt)[is_covered]
+    return changed
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HalfWritten(PixelFault):
-    """Images whose transfer was interrupted."""
-
-    part: float = 0.5
-    fill: Literal["grey", "garbage", "former"] = "grey"
-
-    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
-        rng = self.rng(image)
-        n_rows = round(self.part * len(pixels))
-        spoilt = pixels.copy()
-        rest = spoilt[n_rows:]
-        if self.fill == "grey":
-            rest[:] = 128
-        elif self.fill == "garbage":
-            rest[:] = rng.integers(0, 256, rest.shape)
-        else:
-            rest[:] = np.resize(pixels[: max(n_rows, 1)], rest.shape)
-        return spoilt
+def constant(pixels: Pixels, frame: int, rng: Rng, value: float = float("nan")) -> Pixels:
+    return np.full_like(pixels, value)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RowsShifted(PixelFault):
-    """Rows out of place: bytes missing in the transfer."""
-
-    most_px: int = 40
-
-    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
-        rng = self.rng(image)
-        bands = np.array_split(pixels, 8)
-        shifts = rng.integers(-self.most_px, self.most_px + 1, len(bands)).tolist()
-        rolled = [np.roll(band, by, axis=1) for band, by in zip(bands, shifts, strict=True)]
-        return np.concatenate(rolled)
+def scaled(pixels: Pixels, frame: int, rng: Rng, factor: float) -> Pixels:
+    return (factor * pixels).astype(pixels.dtype)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Turned(_AnyImageFault):
-    """Images turned or mirrored by the mounting of the camera or a setting of the driver."""
-
-    how: Turn = "upside down"
-
-    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
-        views = {
-            "upside down": pixels[::-1],
-            "mirrored": pixels[:, ::-1],
-            "half turn": pixels[::-1, ::-1],
-            "transposed": pixels.swapaxes(0, 1),
-        }
-        return np.ascontiguousarray(views[self.how])
+def quantized(pixels: Pixels, frame: int, rng: Rng, step_m: float) -> Pixels:
+    return (step_m * np.rint(pixels / step_m)).astype(pixels.dtype)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Resized(_AnyImageFault):
-    """Images of another size than that of the calibration."""
-
-    factor: float = 0.5
-
-    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
-        size = [max(round(self.factor * length), 1) for length in pixels.shape[1::-1]]
-        return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_NEAREST))
+def holes(pixels: Pixels, frame: int, rng: Rng, part: float, size_px: int = 8) -> Pixels:
+    """Know nothing of squares of depth: sunlight, dark or shiny surfaces."""
+    height, width = pixels.shape[:2]
+    is_hole = rng.random((height // size_px + 1, width // size_px + 1)) < part
+    spread = is_hole.repeat(size_px, axis=0).repeat(size_px, axis=1)[:height, :width]
+    return np.where(spread, np.nan, pixels).astype(pixels.dtype)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OfType(_AnyImageFault):
-    """Pixels of a type or shape that a source must not give."""
-
-    pixel_type: PixelType = "float64"
-
-    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
-        if self.pixel_type == "flat":
-            return pixels.reshape(-1)
-        if self.pixel_type == "colour":
-            return np.dstack([pixels] * 3) if pixels.ndim == 2 else pixels
-        dtype = np.dtype(self.pixel_type)
-        is_whole = dtype.kind in "iub"
-        return (np.nan_to_num(pixels) if is_whole else pixels).astype(dtype)
+def saturated(pixels: Pixels, frame: int, rng: Rng, depth_m: float) -> Pixels:
+    """End depth at the sensor's range, also at unknown pixels."""
+    return np.asarray(np.fmin(pixels, depth_m), dtype=pixels.dtype)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Shifted(_AnyImageFault):
-    """Images shifted against those of the other stream: a knock on the rig."""
+def rough(pixels: Pixels, frame: int, rng: Rng, sigma_m: float) -> Pixels:
+    """Add noise to depth that grows with its square."""
+    return (pixels + sigma_m * pixels**2 * rng.standard_normal(pixels.shape)).astype(pixels.dtype)
 
-    rows: int = 0
-    columns: int = 0
 
-    def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
-        pad = [(abs(self.rows),) * 2, (abs(self.columns),) * 2, *[(0, 0)] * (pixels.ndim - 2)]
-        if pixels.dtype.kind == "f":
-            padded = np.pad(pixels, pad, constant_values=np.nan)
-        else:
-            padded = np.pad(pixels, pad, mode="edge")
-        v, u = abs(self.rows) - self.rows, abs(self.columns) - self.columns
-        return np.ascontiguousarray(padded[v : v + pixels.shape[0], u : u + pixels.shape[1]])
+def half_written(pixels: Pixels, frame: int, rng: Rng, fill: str = "grey") -> Pixels:
+    """Interrupt the transfer after half of the rows."""
+    n_rows = len(pixels) // 2
+    changed = pixels.copy()
+    rest = changed[n_rows:]
+    rest[:] = rng.integers(0, 256, rest.shape) if fill == "garbage" else 128
+    return changed
+
+
+def rows_shifted(pixels: Pixels, frame: int, rng: Rng, most_px: int = 40) -> Pixels:
+    """Put bands of rows out of place: bytes are missing in the transfer."""
+    bands = np.array_split(pixels, 8)
+    shifts = rng.integers(-most_px, most_px + 1, len(bands)).tolist()
+    return np.concatenate(
+        [np.roll(band, by, axis=1) for band, by in zip(bands, shifts, strict=True)]
+    )
+
+
+def upside_down(pixels: Pixels, frame: int, rng: Rng) -> Pixels:
+    return np.ascontiguousarray(pixels[::-1])
+
+
+def mirrored(pixels: Pixels, frame: int, rng: Rng) -> Pixels:
+    return np.ascontiguousarray(pixels[:, ::-1])
+
+
+def transposed(pixels: Pixels, frame: int, rng: Rng) -> Pixels:
+    return np.ascontiguousarray(pixels.swapaxes(0, 1))
+
+
+def halved(pixels: Pixels, frame: int, rng: Rng) -> Pixels:
+    return np.ascontiguousarray(pixels[::2, ::2])
+
+
+def of_type(pixels: Pixels, frame: int, rng: Rng, dtype: str) -> Pixels:
+    return np.nan_to_num(pixels).astype(dtype)
+
+
+def in_colour(pixels: Pixels, frame: int, rng: Rng) -> Pixels:
+    return np.dstack([pixels] * 3)
+
+
+def shifted(pixels: Pixels, frame: int, rng: Rng, columns: int = 0, rows: int = 0) -> Pixels:
+    """Shift against the other stream; nothing is known of what comes into view."""
+    moved = np.roll(pixels, (rows, columns), axis=(0, 1))
+    if pixels.dtype.kind == "f":
+        moved[: max(rows, 0)] = moved[:, : max(columns, 0)] = np.nan
+        moved[len(moved) + min(rows, 0) :] = moved[:, moved.shape[1] + min(columns, 0) :] = np.nan
+    return moved

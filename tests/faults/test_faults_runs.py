@@ -10,7 +10,7 @@ import pytest
 
 from gvo.io.recording import Sensor
 from gvo.testing import FaultySource
-from tests.faults import Elsewhere, Exchanged, Frozen, Lagging, PixelFault, RowsShifted
+from tests.faults import Elsewhere, Exchanged, Frozen, Lagging, PixelFault, rows_shifted, spoilt
 from tests.faults.catalogue import FAULTS, MADE, PAGE, NamedFault, parameters
 from tests.faults.fault_bench import Outcome, complaints, faulty, run, sound
 
@@ -24,11 +24,11 @@ _OF_IMAGES = (PixelFault, Frozen, Lagging, Elsewhere, Exchanged)
 
 # How many rows of frames.csv are skipped; 0 where nothing stands here.
 SKIPPED: dict[str, tuple[str, ...]] = {
-    "1": ("late-frame", "stamp-ahead", "stamp-behind", "stamp-zero"),
-    "2": ("image-damaged", "image-unreadable", "image-too-large", "decoder-fails"),
+    "1": ("late-frame", "stamp-ahead", "stamp-behind"),
+    "2": ("image-damaged", "image-unreadable", "decoder-fails"),
     "3": (
-        "delivered-twice", "clock-stepped-back", "transposed", "type-float", "type-16-bit",
-        "type-flat", "depth-nan", "depth-zero", "depth-infinite", "depth-negative",
+        "delivered-twice", "transposed", "type-float", "type-16-bit",
+        "depth-nan", "depth-negative",
     ),
     "4": ("dropped-right",),
     "6": ("frozen", "right-frozen"),
@@ -56,20 +56,16 @@ TOLD = {
     "disk-fails": "cannot be read on: OSError: Input/output error",
     "image-damaged": "the image is damaged",
     "image-unreadable": "OSError: Input/output error",
-    "image-too-large": "MemoryError: no room",
     "decoder-fails": "bad decode",
     "all-damaged": "the image is damaged",
     "lost": "(frames.csv: coasting, lost)",
     "elsewhere": "(frames.csv: coasting, lost)",
     "clock-set-back": "the stamp goes back",
-    "clock-stepped-back": "the stamp goes back",
     "stamp-ahead": "the stamp is 3600.03 s ahead of the one before",
     "stamp-behind": "the stamp goes back",
-    "stamp-zero": "the stamp goes back",
     "stamps-zero": "--set sync.stamps=recording",
     "stamps-equal": "repeats",
     "stamps-backwards": "the stamp goes back",
-    "stamps-from-zero": "share no stamps",
     "stamps-negative": "share no stamps",
     "stamps-in-seconds": "repeats",
     "stamps-in-microseconds": "share no stamps",
@@ -84,14 +80,12 @@ TOLD = {
     "depth-resized": "expected 256x192 pixels by the calibration, got 128x96",
     "type-float": "got float64",
     "type-16-bit": "got uint16",
-    "type-flat": "got uint8 (49152,)",
     "depth-16-bit": "got uint16",
     "depth-in-colour": "got float32 (192, 256, 3)",
     "exchanged": "are left and right exchanged",
     "mirrored": "are left and right exchanged",
     "right-lower": "no frame could be registered",
     "depth-in-mm": "depth.scale wrong",
-    "depth-in-km": "depth.scale wrong",
     "depth-holes": "no frame could be registered",
     "depth-noisy": "no frame could be registered",
     "baseline-in-mm": "is the calibration",
@@ -99,7 +93,7 @@ TOLD = {
     "baseline-zero": "the baseline must be positive",
     "focal-length-of-one": "not rectified to one camera",
     **dict.fromkeys(
-        ("depth-nan", "depth-zero", "depth-infinite", "depth-negative", "depth-all-nan"),
+        ("depth-nan", "depth-negative", "depth-all-nan"),
         "no pixel of the depth image is known",
     ),
 }
@@ -138,14 +132,15 @@ def test_a_run_over_a_bad_recording_does_what_the_table_says(
 def test_rows_that_lost_their_place_hardly_give_false_poses(sensor: Sensor, tmp_path: Path) -> None:
     recording = sound(sensor, 20)
     n_wrong = 0
-    for number in range(12):
-        bands = RowsShifted(first=8, end=10, seed=number // 2, most_px=20 + 20 * (number % 2))
+    for number in range(6):
+        most_px = 20 + 20 * (number % 2)
+        bands = spoilt(rows_shifted, most_px=most_px, first=8, end=10, seed=number // 2)
         out = tmp_path / str(number)
         outcome = run(FaultySource(recording, bands), recording.truth, out)
         assert outcome.n("coasting") > 0
         n_wrong += bool(outcome.deviations.max() > _MAX_DEVIATION)
-    # Without a check of rows and of the view it is 11 of 12.
-    assert n_wrong <= 3
+    # Without a check of rows and of the view nearly all are.
+    assert n_wrong <= 2
 
 
 def _nothing_is_lost(fault: NamedFault, outcome: Outcome) -> None:
@@ -234,13 +229,3 @@ def test_the_page_shows_each_fault_that_is_made() -> None:
     assert list(FAULTS) == list(MADE)
     assert f"{len(FAULTS)} faults" in PAGE.read_text()
     assert any(fault.is_silent for fault in FAULTS.values())
-
-
-def test_the_short_run_takes_one_fault_of_each_group() -> None:
-    chosen = [fault.group for fault in FAULTS.values() if not parameters(fault=fault).marks]
-    assert chosen == list(dict.fromkeys(fault.group for fault in FAULTS.values()))
-    assert len(chosen) == 7
-
-
-def test_what_is_expected_is_of_faults_that_exist() -> None:
-    assert {*N_SKIPPED, *N_UNPAIRED, *TOLD} <= set(FAULTS)

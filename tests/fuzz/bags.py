@@ -1,58 +1,92 @@
-"""Whole bag files, read through the package's readers, and walked over without their index."""
+"""Whole bag files, read through the package's readers, and single messages as they are serialised.
+
+Bags are also walked over without their index.
+"""
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
-from rosbags.rosbag2 import Writer as Writer2
+import cv2
+import numpy as np
 
 from gvo.errors import GvoError
-from gvo.io.bag.reader import TF_TYPE, BagReader, find_files, typestore
+from gvo.io.bag.image_encodings import DEPTHS, IMAGES
+from gvo.io.bag.messages import (
+    camera_fields,
+    decode_compressed,
+    decode_depth,
+    decode_grey_or_color,
+    stamp_of,
+)
+from gvo.io.bag.reader import TF_TYPE, BagMessage, BagReader, find_files, serialize
 from gvo.io.bag.recovery.inflate import DamageError
 from gvo.io.bag.recovery.mcap import McapScan
 from gvo.io.bag.recovery.ros1 import Ros1Scan
 from gvo.io.bag.recovery.scan import Scan
 from gvo.io.bag.source import BagSource
-from gvo.io.bag.topics import COMPRESSED_TYPE
-from gvo.io.poses.tf import read_tf
-from tests.fuzz.messages import make_messages, serialise
+from gvo.io.bag.topics import CAMERA_INFO_TYPE, COMPRESSED_TYPE, IMAGE_TYPE, Topic
+from gvo.io.calibration.camera_info import make_calibration, make_rgbd_calibration
+from gvo.io.poses.tf import TfBuffer, read_tf
 from tests.fuzz.mutations import mutate_bytes, mutate_text
-from tests.fuzz.target import Folder, Target
+from tests.fuzz.target import Target, folder, write
+from tests.make import bags as made
 
-_TOPICS = {
-    "/left/image_rect": "sensor_msgs/msg/Image",
-    "/right/image_rect": "sensor_msgs/msg/Image",
-    "/left/camera_info": "sensor_msgs/msg/CameraInfo",
-    "/right/camera_info": "sensor_msgs/msg/CameraInfo",
-    "/tf": TF_TYPE,
-    "/left/image_rect/compressed": COMPRESSED_TYPE,
-}
-_LEFT_INFO = "/left/camera_info"
 _SCANS: dict[str, type[Scan]] = {".bag": Ros1Scan, ".mcap": McapScan}
 _MAX_MESSAGES = 200
+_TYPES = (IMAGE_TYPE, COMPRESSED_TYPE, CAMERA_INFO_TYPE, TF_TYPE)
+_PIXELS = np.arange(48, dtype=np.uint8).reshape(6, 8)
 
 
-@cache
-def _folder() -> Folder:
-    return Folder()
+def _messages(stamp_ns: int = 5_000_000_006, *, is_ros1: bool) -> list[made.Message]:
+    """Return messages of a small stereo camera and of tf."""
+    options: dict[str, Any] = {"is_ros1": is_ros1}
+    png = cv2.imencode(".png", _PIXELS)[1].ravel()
+    header = made.header(stamp_ns=stamp_ns, **options)
+    compressed = made.make(COMPRESSED_TYPE, header=header, format="png", data=png, **options)
+    found = [
+        made.tf("/tf", "base", "camera", np.eye(4), stamp_ns, **options),
+        ("/left/image_rect/compressed", COMPRESSED_TYPE, stamp_ns, compressed),
+    ]
+    for side, shift in (("left", 0.0), ("right", -2.0)):
+        P = [8.0, 0, 4, shift, 0, 8, 3, 0, 0, 0, 1, 0]
+        numbers: dict[str, Any] = {"width": 8, "height": 6, "R": np.eye(3), "P": P}
+        numbers["K"] = np.reshape(P, (3, 4))[:, :3]
+        topic = f"/{side}/camera_info"
+        found.append(made.camera_info(topic, stamp_ns=stamp_ns, **options, **numbers))
+        found.append(made.image(f"/{side}/image_rect", _PIXELS, "mono8", stamp_ns, **options))
+    return found
+
+
+def _bag(suffix: str, compression: str) -> bytes:
+    messages = [
+        message
+        for stamp_ns in (5_000_000_006, 5_100_000_006)
+        for message in _messages(stamp_ns, is_ros1=suffix == ".bag")
+    ]
+    with tempfile.TemporaryDirectory() as name:
+        path = made.write(Path(name) / f"made{suffix}", messages, compression=compression)
+        return path.read_bytes()
+
+
+def _bag_seeds(suffix: str, compressions: tuple[str, ...]) -> list[bytes]:
+    whole = [_bag(suffix, compression) for compression in compressions]
+    return [*whole, whole[0][: len(whole[0]) * 2 // 3]]
 
 
 def _read(data: bytes, *, suffix: str) -> None:
     """Open a file as a recording, load what it yields; then walk over its records."""
-    path = _folder().write(f"fuzz{suffix}", data)
+    path = write(f"fuzz{suffix}", data)
     if suffix in _SCANS:
         _walk(path)
     reader = BagReader(path)
     names = [topic.name for topic in reader.topics]
     for message in islice(reader.messages(names), _MAX_MESSAGES):
         _try(message.decode)
-    _check_line(reader.damage)
+    assert "\n" not in reader.damage
     _try(partial(read_tf, reader))
     source = BagSource(path)
     for image in islice(source.images(), _MAX_MESSAGES):
@@ -66,7 +100,7 @@ def _walk(path: Path) -> None:
         scan = _SCANS[path.suffix](path)
         for _ in islice(scan.messages({channel.name for channel in scan.counts}), _MAX_MESSAGES):
             pass
-        _check_line(scan.damage)
+        assert "\n" not in scan.damage
     except DamageError:
         return
 
@@ -78,73 +112,49 @@ def _try(read: Callable[[], object]) -> None:
         return
 
 
-def _check_line(text: str) -> None:
-    if "\n" in text:
-        raise AssertionError(f"damage is told in more than one line: {text[:200]!r}")
+def _message(data: bytes) -> None:
+    """Decode a message; the first byte chooses its type, the second ROS 1 or 2."""
+    number, is_ros1 = data.ljust(2, b"\0")[:2]
+    topic = Topic(name="/topic", type=_TYPES[number % len(_TYPES)], n_messages=1)
+    message = BagMessage(topic=topic, log_time_ns=0, data=data[2:], is_ros1=is_ros1 % 2 == 1)
+    content = message.decode()
+    if topic.type == TF_TYPE:
+        buffer = TfBuffer()
+        for transform in content.transforms:
+            buffer.add_message(transform)
+        found = buffer.lookup("base", "camera", 5_000_000_006)
+        assert not isinstance(found, np.ndarray) or np.all(np.isfinite(found))
+        assert len(buffer.notes) <= 3
+        return
+    stamp_of(content.header)
+    if topic.type == COMPRESSED_TYPE:
+        decode_compressed(content, "/topic")
+    elif topic.type == CAMERA_INFO_TYPE:
+        for make in (make_calibration, make_rgbd_calibration):
+            calibration = make(camera_fields(content, "/topic"), is_rectified=False)
+            assert np.all(np.isfinite(calibration.P))
+    elif content.encoding in DEPTHS:
+        decode_depth(content, 1000.0, "/topic")
+    else:
+        decode_grey_or_color(content, "/topic")
 
 
-def _make(suffix: str, compression: str) -> bytes:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"made{suffix}"
-        if suffix == ".bag":
-            _write_ros1(path, compression)
-            return path.read_bytes()
-        plugin = StoragePlugin.MCAP if suffix == ".mcap" else StoragePlugin.SQLITE3
-        path = path.with_suffix("")
-        _write_ros2(path, plugin, compression)
-        (found,) = path.glob(f"*{suffix}")
-        return found.read_bytes()
-
-
-def _write_ros1(path: Path, compression: str) -> None:
-    writer = Writer1(path)
-    if compression:
-        writer.set_compression(Writer1.CompressionFormat[compression])
-    with writer:
-        _fill(writer, is_ros1=True)
-
-
-def _write_ros2(path: Path, plugin: StoragePlugin, compression: str) -> None:
-    writer = Writer2(path, version=9, storage_plugin=plugin)
-    if compression:
-        mode = CompressionMode[compression]
-        writer.set_compression(mode, CompressionFormat.ZSTD)
-    with writer:
-        _fill(writer, is_ros1=False)
-
-
-def _fill(writer: Writer1 | Writer2, *, is_ros1: bool) -> None:
-    messages = make_messages(is_ros1=is_ros1)
-    store = typestore(is_ros1=is_ros1)
-    connections = {
-        name: writer.add_connection(name, type_, typestore=store) for name, type_ in _TOPICS.items()
-    }
-    for stamp_ns in (5_000_000_006, 5_100_000_006):
-        for name, type_ in _TOPICS.items():
-            message = _at_left(messages[type_]) if name == _LEFT_INFO else messages[type_]
-            content = serialise(message, type_, is_ros1=is_ros1)
-            writer.write(connections[name], stamp_ns, content)
-
-
-def _at_left(message: Any) -> Any:
-    """Return the `CameraInfo` of a camera without an offset to the left one."""
-    name = "P" if hasattr(message, "P") else "p"
-    P = getattr(message, name).copy()
-    P[3] = 0.0
-    return replace(message, **{name: P})
-
-
-def _seeds(suffix: str, compressions: tuple[str, ...]) -> list[bytes]:
-    made = [_make(suffix, compression) for compression in compressions]
-    return [*made, made[0][: len(made[0]) * 2 // 3]]
+def _message_seeds() -> list[bytes]:
+    seeds = []
+    for is_ros1 in (False, True):
+        messages = _messages(is_ros1=is_ros1)
+        for encoding in {**IMAGES, **DEPTHS}:
+            messages.append(made.image("/image", _PIXELS, encoding, is_ros1=is_ros1))
+        for _, type_, _, message in messages:
+            data = serialize(message, type_, is_ros1=is_ros1)
+            seeds.append(bytes([_TYPES.index(type_), is_ros1]) + bytes(data))
+    return seeds
 
 
 def _metadata(data: bytes) -> None:
-    folder = _folder().path / "folder"
-    folder.mkdir(exist_ok=True)
-    (folder / "metadata.yaml").write_bytes(data)
-    (folder / "held_0.mcap").write_bytes(b"")
-    find_files(folder)
+    write("folder/metadata.yaml", data)
+    write("folder/held_0.mcap", b"")
+    find_files(folder() / "folder")
 
 
 _METADATA = b"""rosbag2_bagfile_information:
@@ -157,19 +167,20 @@ _METADATA = b"""rosbag2_bagfile_information:
 """
 
 
-def _target(name: str, suffix: str, compressions: tuple[str, ...]) -> Target:
+def _target(name: str, suffix: str, *compressions: str) -> Target:
     return Target(
         name=name,
         run=partial(_read, suffix=suffix),
-        seeds=partial(_seeds, suffix, compressions),
+        seeds=partial(_bag_seeds, suffix, compressions),
         mutate=mutate_bytes,
-        max_bytes=32768,
+        is_slow=True,
     )
 
 
 TARGETS = (
-    _target("ros1_bags", ".bag", ("", "BZ2", "LZ4")),
-    _target("mcap_bags", ".mcap", ("", "STORAGE", "MESSAGE")),
-    _target("sqlite_bags", ".db3", ("", "MESSAGE")),
+    _target("ros1_bags", ".bag", "", "BZ2", "LZ4"),
+    _target("mcap_bags", ".mcap", "", "STORAGE", "MESSAGE"),
+    _target("sqlite_bags", ".db3", "", "MESSAGE"),
+    Target(name="messages", run=_message, seeds=_message_seeds),
     Target(name="bag_metadata", run=_metadata, seeds=lambda: [_METADATA, b""], mutate=mutate_text),
 )

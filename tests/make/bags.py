@@ -39,7 +39,9 @@ def write(path: Path, messages: Sequence[Message], *, compression: str = "") -> 
     plugin = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
     writer: Any = Writer1(path) if is_ros1 else None
     writer = writer or Writer2(path.with_suffix(""), version=8, storage_plugin=plugin)
-    if compression:
+    if compression and is_ros1:
+        writer.set_compression(Writer1.CompressionFormat[compression])
+    elif compression:
         writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
     foreign = {"msgdef": "no definition (", "md5sum" if is_ros1 else "rihs01": "RIHS01_" + "0" * 64}
     with writer:
@@ -68,7 +70,14 @@ def header(frame_id: str = "camera", stamp_ns: int = 0, *, is_ros1: bool = True)
     return make("std_msgs/msg/Header", is_ros1=is_ros1, stamp=stamp, frame_id=frame_id, **sequence)
 
 
-def camera_info(topic: str, frame_id: str = "camera", stamp_ns: int = 0, **changes: Any) -> Message:
+def camera_info(
+    topic: str,
+    frame_id: str = "camera",
+    stamp_ns: int = 0,
+    *,
+    is_ros1: bool = True,
+    **changes: Any,
+) -> Message:
     """Return a `CameraInfo` of 48 x 32 pixels without R and P; `roi` takes a part of its fields."""
     fields: dict[str, Any] = {
         "height": 32,
@@ -83,10 +92,13 @@ def camera_info(topic: str, frame_id: str = "camera", stamp_ns: int = 0, **chang
         "roi": {},
     } | changes
     for name in "DKRP":
-        fields[name] = np.array(fields[name], dtype=np.float64).ravel()
+        matrix = np.array(fields.pop(name), dtype=np.float64).ravel()
+        fields[name if is_ros1 else name.lower()] = matrix
     region = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0) | {"do_rectify": False}
-    fields["roi"] = make("sensor_msgs/msg/RegionOfInterest", **(region | fields["roi"]))
-    message = make(CAMERA_INFO_TYPE, header=header(frame_id, stamp_ns), **fields)
+    region |= fields["roi"]
+    fields["roi"] = make("sensor_msgs/msg/RegionOfInterest", is_ros1=is_ros1, **region)
+    fields["header"] = header(frame_id, stamp_ns, is_ros1=is_ros1)
+    message = make(CAMERA_INFO_TYPE, is_ros1=is_ros1, **fields)
     return topic, CAMERA_INFO_TYPE, stamp_ns, message
 
 

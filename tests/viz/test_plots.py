@@ -1,8 +1,5 @@
 """Plots of trajectories, seen through their pixels and their SVG text."""
 
-import subprocess
-import sys
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -112,27 +109,11 @@ def test_labels_carry_units_names_and_errors(tmp_path: Path) -> None:
     assert "_$a$ (ATE 0.1" in text.replace("\\", "")
 
 
-def test_rows_without_stamps_are_counted(tmp_path: Path) -> None:
-    rows = [replace(curve(seed), stamps_from="rows") for seed in range(2)]
-    text = svg_text(tmp_path, rows[0], {"raw": rows[1]})
-    assert ">row</text>" in text
-    assert "elapsed" not in text
-
-
 def test_without_a_reference_the_positions_are_drawn(tmp_path: Path) -> None:
     text = svg_text(tmp_path, None, {"raw": curve(1), "smoothed": curve(2)})
     for label in ("x [m]", "y [m]", "z [m]", "elapsed [s]", "raw", "smoothed"):
         assert f">{label}</text>" in text
     assert "reference" not in text
-
-
-def test_lines_are_broken_where_poses_are_missing(tmp_path: Path) -> None:
-    whole, path = curve(0), tmp_path / "plot.png"
-    pixels = []
-    for trajectory in (whole, whole.select([*range(10), *range(50, 60)])):
-        plot_trajectories(path, None, {"raw": trajectory})
-        pixels.append(n_pixels(path, RAW))
-    assert pixels[1] < 0.6 * pixels[0]
 
 
 def test_one_pose_and_many_estimates_are_drawn(tmp_path: Path) -> None:
@@ -155,20 +136,6 @@ def test_a_file_of_another_kind_and_nothing_to_draw_are_refused(tmp_path: Path) 
     for estimates in ({}, {"raw": curve(0).select([])}):
         with pytest.raises(ValueError, match="at least one estimate"):
             plot_trajectories(tmp_path / "plot.png", None, estimates)
-
-
-def test_drawing_leaves_the_process_as_it_was(tmp_path: Path) -> None:
-    program = (
-        "import sys; import gvo, gvo.cli.main, gvo.runs.run, gvo.runs.smooth;"
-        "assert 'matplotlib' not in sys.modules;"
-        "import matplotlib, numpy as np; import gvo.viz.plots as plots;"
-        "from gvo.trajectory.trajectory import Trajectory;"
-        "one = Trajectory(stamps_ns=np.array([0]), T_world_frame=np.eye(4)[None]);"
-        f"plots.plot_trajectories({str(tmp_path / 'p.svg')!r}, None, {{'raw': one}});"
-        "assert 'matplotlib.pyplot' not in sys.modules;"
-        "assert matplotlib.rcParams['svg.hashsalt'] is None"
-    )
-    subprocess.run([sys.executable, "-c", program], check=True, cwd=Path(__file__).parents[2])
 
 
 def test_the_plane_of_positions_is_that_of_their_motion(tmp_path: Path) -> None:

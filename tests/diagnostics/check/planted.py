@@ -13,7 +13,7 @@ from gvo.io.recording import Sensor, Source
 from gvo.io.synthetic import SyntheticRecording, WorldName
 from tests.recordings import Held, hold
 
-N_FRAMES = 40
+N_FRAMES = 26
 
 
 @cache

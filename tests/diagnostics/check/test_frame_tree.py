@@ -68,14 +68,6 @@ def test_a_recording_without_transforms_or_names_is_no_fault() -> None:
     assert look(tree(), "")["tf: camera"].verdict == "unknown"
 
 
-def test_a_single_transform_is_no_robot_that_misses_its_camera() -> None:
-    buffer = TfBuffer()
-    add_transform(buffer, "world", "ground_truth", 0, np.eye(4))
-    findings = look(buffer)
-    assert complaints(findings) == set()
-    assert findings["tf: frames"].value == "ground_truth, world"
-
-
 def test_the_ground_truth_of_a_data_set_is_no_second_tree() -> None:
     buffer = tree()
     add_transform(buffer, "world", "ground_truth", 0, np.eye(4))

@@ -23,8 +23,6 @@ from tests.diagnostics.check.planted import check, complaints, find, render
 from tests.recordings import Held
 
 Fault = made.Fault | Callable[[Held], Held]
-_RNG = np.random.default_rng(5)
-WORLDS = [pytest.param("driving", marks=pytest.mark.acceptance), "handheld"]
 
 
 def planted(fault: Fault, recording: Held) -> FaultySource | Held:
@@ -36,13 +34,9 @@ def planted(fault: Fault, recording: Held) -> FaultySource | Held:
 @pytest.mark.parametrize(
     ("world", "sensor", "seed"),
     [
-        ("driving", "stereo", 0),
+        pytest.param("driving", "stereo", 0, marks=pytest.mark.acceptance),
         ("handheld", "stereo", 0),
         ("handheld", "rgbd", 0),
-        pytest.param("handheld", "rgbd", 1, marks=pytest.mark.acceptance),
-        pytest.param("driving", "stereo", 1, marks=pytest.mark.acceptance),
-        pytest.param("handheld", "stereo", 1, marks=pytest.mark.acceptance),
-        pytest.param("handheld", "rgbd", 2, marks=pytest.mark.acceptance),
     ],
 )
 def test_clean_recordings_give_no_complaints(world: str, sensor: str, seed: int) -> None:
@@ -92,13 +86,10 @@ def moved(image: NDArray[Any], du: float, dv: float) -> NDArray[Any]:
         (shifted_rows, {"left/right: row offset"}),
         (rotated, {"left/right: row spread"}),
         (made.Exchanged(), {"left/right: order"}),
-        (made.Turned(how="half turn", streams=(1,)), {"left/right: matches"}),
-        (made.Exposed(factor=0.6, streams=(1,)), {"left/right: brightness ratio"}),
     ],
 )
-@pytest.mark.parametrize("world", WORLDS)
-def test_stereo_faults_alone_are_found(world: str, fault: Fault, expected: set[str]) -> None:
-    result = check(planted(fault, render(world, "stereo")))
+def test_stereo_faults_alone_are_found(fault: Fault, expected: set[str]) -> None:
+    result = check(planted(fault, render("handheld", "stereo")))
     found = complaints(result)
     # A turn of the image moves its rows at the middle hardly, but not by exactly nothing.
     assert expected <= found <= expected | {"left/right: row offset"}
@@ -107,10 +98,9 @@ def test_stereo_faults_alone_are_found(world: str, fault: Fault, expected: set[s
         assert not result.is_healthy
 
 
-@pytest.mark.parametrize("world", WORLDS)
 @pytest.mark.parametrize(("n_frames", "word"), [(1, "late"), (-1, "early")])
-def test_a_stream_a_frame_late_is_found_in_its_images(world: str, n_frames: int, word: str) -> None:
-    result = check(out_of_step(n_frames)(render(world, "stereo")))
+def test_a_stream_a_frame_late_is_found_in_its_images(n_frames: int, word: str) -> None:
+    result = check(out_of_step(n_frames)(render("handheld", "stereo")))
     finding = find(result, "left/right: same moment")
     assert finding.verdict == "fault"
     assert f"a frame {word}" in finding.fix
@@ -119,23 +109,9 @@ def test_a_stream_a_frame_late_is_found_in_its_images(world: str, n_frames: int,
     assert complaints(result) <= {finding.name} | others
 
 
-@pytest.mark.parametrize(("factor", "verdict"), [(1000.0, "fault"), (0.001, "fault"), (1, "ok")])
-def test_a_baseline_in_another_unit_is_found(factor: float, verdict: str) -> None:
+def test_a_lens_not_rectified_is_found_though_rows_hardly_differ() -> None:
     recording = render("handheld", "stereo")
-    left, right = recording.info.calibrations
-    P = right.P.copy()
-    P[0, 3] *= factor
-    info = replace(recording.info, calibrations=(left, replace(right, P=P)))
-    finding = find(check(replace(recording, info=info), n_samples=2), "baseline")
-    assert finding.verdict == verdict
-    assert finding.value == pytest.approx(-right.P[0, 3] / right.P[0, 0] * factor)
-
-
-@pytest.mark.parametrize("k1", [-0.3, pytest.param(0.25, marks=pytest.mark.acceptance)])
-@pytest.mark.parametrize("world", WORLDS)
-def test_a_lens_not_rectified_is_found_though_rows_hardly_differ(world: str, k1: float) -> None:
-    recording = render(world, "stereo")
-    camera = recording.info.camera
+    camera, k1 = recording.info.camera, -0.3
     distorted = recording.with_pixels(lambda image: through_lens(image, camera.K, k1))
     finding = find(check(distorted, n_samples=8), "left/right: lens distortion")
     assert finding.verdict == "fault"
@@ -163,35 +139,16 @@ def zoomed_depth(recording: Any) -> Any:
     return recording.with_pixels(zoom, stream=1)
 
 
-def shifted(columns: int, rows: int) -> made.Shifted:
-    return made.Shifted(columns=columns, rows=rows, streams=(1,))
-
-
-_SCALE = {"depth: scale", "depth: within limits", "depth: corners with depth"}
-_PLACE = {"depth: misregistration"}
-
-
 @pytest.mark.parametrize(
     ("fault", "expected"),
     [
-        (made.DepthScaled(factor=1000.0), _SCALE),
-        (made.DepthScaled(factor=0.001), _SCALE),
-        (made.DepthHoles(part=0.6), {"depth: unknown"}),
-        (shifted(5, 0), _PLACE),
-        pytest.param(shifted(-4, 0), _PLACE, marks=pytest.mark.acceptance),
-        pytest.param(shifted(0, 4), _PLACE, marks=pytest.mark.acceptance),
-        (shifted(4, -5), _PLACE),
-        (zoomed_depth, _PLACE),
+        (made.of_depth(made.holes, part=0.6), {"depth: unknown"}),
+        (made.of_all(made.shifted, columns=4, rows=-5, streams=(1,)), {"depth: misregistration"}),
+        (zoomed_depth, {"depth: misregistration"}),
     ],
 )
 def test_faults_of_depth_are_found_and_nothing_else(fault: Fault, expected: set[str]) -> None:
     assert complaints(check(planted(fault, render("handheld", "rgbd")))) == expected
-
-
-def test_depth_of_a_few_values_is_found() -> None:
-    found = complaints(check(FaultySource(render("handheld", "rgbd"), made.DepthQuantized())))
-    # Its own steps are edges that colour does not have.
-    assert {"depth: levels"} <= found <= {"depth: levels", "depth: misregistration"}
 
 
 def noise_alone(recording: Held) -> Held:
@@ -208,13 +165,12 @@ WITH_DEPTH = "depth: corners with depth"
 @pytest.mark.parametrize(
     ("fault", "expected", "tolerated"),
     [
-        (made.Exposed(factor=0.05), {"colour: brightness"}, {"colour: corners", WITH_DEPTH}),
         (
-            made.Exposed(factor=3.0),
+            made.spoilt(made.exposed, factor=3.0),
             {"colour: clipped pixels"},
             {"colour: brightness", "colour: corners", WITH_DEPTH},
         ),
-        (made.Blurred(sigma_px=2.5), {"colour: blur"}, set()),
+        (made.spoilt(made.blurred, sigma_px=2.5), {"colour: blur"}, set()),
         (noise_alone, {"colour: corners"}, {"colour: corners found again", WITH_DEPTH}),
     ],
 )
@@ -225,6 +181,7 @@ def test_faults_of_images_are_found_and_nothing_else(
     assert expected <= found <= expected | tolerated
 
 
+@pytest.mark.acceptance
 def test_images_in_another_order_are_not_found_again() -> None:
     recording = render("driving", "stereo")
     colour = recording.stream(0)
@@ -237,17 +194,6 @@ def test_images_in_another_order_are_not_found_again() -> None:
     assert {"left: corners found again", "right: corners found again"} <= found
 
 
-def test_frozen_images_are_found() -> None:
-    frozen = FaultySource(render("handheld", "rgbd"), made.Frozen(first=1))
-    assert {"colour: frozen images", "depth: frozen images"} == complaints(check(frozen))
-
-
-def test_torn_images_are_found() -> None:
-    torn = made.HalfWritten(part=2.0 / 3.0, end=12, streams=(0,))
-    result = check(FaultySource(render("handheld", "rgbd"), torn))
-    assert "colour: torn images" in complaints(result)
-
-
 def test_images_that_do_not_decode_are_counted_and_quoted() -> None:
     fault = made.Unloadable(end=12, streams=(1,), message="/camera: the JPEG image is truncated")
     result = check(FaultySource(render("handheld", "rgbd"), fault))
@@ -257,7 +203,7 @@ def test_images_that_do_not_decode_are_counted_and_quoted() -> None:
 
 
 def test_damage_ends_the_reading_but_not_the_check() -> None:
-    fault = made.BrokenOff(first=25, message="a.bag: truncated at 61 %")
+    fault = made.BrokenOff(first=20, message="a.bag: truncated at 61 %")
     result = check(FaultySource(render("handheld", "rgbd"), fault))
     assert complaints(result) == {"reading"}
     assert find(result, "reading").value == "a.bag: truncated at 61 %"
@@ -277,19 +223,13 @@ def test_a_calibration_that_changes_on_the_way_is_told(
 
 
 @pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
-@pytest.mark.parametrize("n_items", [0, 1, 2, 3, 4])
+@pytest.mark.parametrize("n_items", [0, 1, 3])
 def test_hardly_any_images_are_reported_and_nothing_breaks(sensor: str, n_items: int) -> None:
     recording = render("handheld", sensor)
     result = check(replace(recording, items=recording.items[:n_items]))
     # a depth image less than colour is no loss, a right one less than left is
-    assert result.is_healthy == (n_items in (2, 4) or (n_items, sensor) == (3, "rgbd"))
+    assert result.is_healthy == ((n_items, sensor) == (3, "rgbd"))
     assert json.loads(json.dumps(result.as_json(), allow_nan=False))
-
-
-def test_a_recording_without_a_single_usable_image_is_no_crash() -> None:
-    for sensor in ("stereo", "rgbd"):
-        broken = FaultySource(render("handheld", sensor), made.Unloadable())
-        assert complaints(check(broken)) == {"frames that cannot be used"}
 
 
 def test_only_the_samples_are_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -305,7 +245,7 @@ def test_only_the_samples_are_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
         return replace(image, load=load)
 
     check(render("handheld", "rgbd").mapped(count), n_samples=3)
-    assert sorted(loaded) == [(s, n) for s in (0, 1) for n in (0, 1, 19, 20, 38, 39)]
+    assert sorted(loaded) == [(s, n) for s in (0, 1) for n in (0, 1, 12, 13, 24, 25)]
 
 
 @pytest.mark.recorded

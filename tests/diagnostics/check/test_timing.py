@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Any, TypeAlias
 
@@ -158,12 +157,6 @@ def test_a_tolerance_that_is_too_small_is_named_with_one_that_is_not() -> None:
     assert find(result, "left/right: row offset").verdict == "ok"
 
 
-def test_dropped_images_of_a_rendered_recording_are_found() -> None:
-    recording = render("handheld", "rgbd")
-    thinned = recording.mapped(lambda image, number: None if number % 7 == 3 else image)
-    assert complaints(check(thinned)) == {"colour: dropped frames", "depth: dropped frames"}
-
-
 LATE = np.random.default_rng(1).exponential(2 * MS, 300)
 ELAPSED = REGULAR - REGULAR[0]
 
@@ -182,13 +175,3 @@ def test_clocks_that_drift_or_are_set_are_found(delays_ns: Stamps, told: str, va
     assert complaints(findings) == ({told} if told else set())
     if told:
         assert findings[told].value == pytest.approx(value, rel=0.1)
-
-
-def test_the_recording_clock_is_told_of_each_stream() -> None:
-    recording = render("handheld", "rgbd").mapped(
-        lambda image, number: replace(image, log_time_ns=image.stamp_ns + 7 * MS)
-    )
-    result = check(recording)
-    assert find(result, "colour: recording clock").value == "0.007 s after the header"
-    assert find(result, "depth: clock drift").value == pytest.approx(0.0, abs=1e-9)
-    assert complaints(result) == set()

@@ -149,14 +149,13 @@ def test_the_offsets_of_the_rig_are_those_that_the_frame_was_measured_with() -> 
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_is_told_how_far_rows_are_moved_for_the_readout_assumed(kind: str) -> None:
     moved_px = []
-    for readout_ms in (0.0, 12.0, 24.0):
+    for readout_ms in (12.0, 24.0):
         explanation = explained(kind, "rgbd", LAST, f"camera.readout_ms={readout_ms}")
         assert explanation.readout_ms == readout_ms
         assert explanation.registration is not None
         moved_px.append(explanation.registration.row_motion_px)
-    assert moved_px[0] == 0.0
-    assert 0.3 < moved_px[1] < 20.0
-    assert moved_px[2] == pytest.approx(2.0 * moved_px[1], rel=0.2)
+    assert 0.3 < moved_px[0] < 20.0
+    assert moved_px[1] == pytest.approx(2.0 * moved_px[0], rel=0.2)
 
 
 def test_a_first_frame_is_explained_without_a_motion() -> None:
@@ -176,11 +175,6 @@ def test_a_black_frame_and_the_one_after_are_explained_as_far_as_they_got(kind: 
     after = explain_frame(spoiled(), BLACK + 1, config=configuration(kind))
     assert after.result.registration is not None
     assert after.reference_index == BLACK - 1
-
-
-def test_a_faulty_frame_counts() -> None:
-    after = explain_frame(spoiled(is_faulty=True), BLACK + 1)
-    assert (after.index, after.reference_index) == (BLACK + 1, BLACK - 1)
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,7 @@ from gvo.viz.report.paths import World, lines_of, path_plots
 MAP_GRID = (512_345.2, 4_600_123.5, -33.0)
 
 
-@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), MAP_GRID])
-@pytest.mark.parametrize("step_m", [1e-5, 1.0, 400.0])
+@pytest.mark.parametrize(("origin", "step_m"), [((0.0, 0.0, 0.0), 1e-5), (MAP_GRID, 400.0)])
 def test_numbers_and_labels_stay_in_the_picture_and_apart(
     origin: tuple[float, float, float], step_m: float
 ) -> None:

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 
-from gvo.errors import ConfigurationError
 from gvo.geometry import se3
 from gvo.io.run_folder.reader import read_run
 from gvo.io.synthetic import SyntheticRecording
@@ -17,7 +16,6 @@ from gvo.trajectory.evaluation import evaluate
 from gvo.trajectory.trajectory import Trajectory
 from gvo.viz.report import write_comparison_report, write_run_report
 from tests.conftest import run_of
-from tests.make.long_run import make_long_run
 from tests.viz.report_page import Page
 
 SECTIONS = [
@@ -64,30 +62,36 @@ def test_each_section_is_there_and_drawn_and_nothing_outside_referred_to(page: P
     content.assert_nothing_outside()
 
 
-def test_equal_input_gives_equal_files(page: Path, folder: Path, tmp_path: Path) -> None:
-    again = tmp_path / "again.html"
-    write_run_report(again, read_run(folder), plots=tmp_path / "plots")
-    assert again.read_bytes() == page.read_bytes()
-    first, second = (sorted((each.parent / "plots").iterdir()) for each in (page, again))
+def test_the_plots_are_files_named_by_their_order(page: Path) -> None:
+    found = sorted((page.parent / "plots").iterdir())
     names = [f"{n:02d}_{s}{e}" for n, s in enumerate(SECTIONS, 1) for e in (".pdf", ".png")]
-    assert [path.name for path in first] == names
-    assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
-    assert np.asarray(cv2.imread(str(first[1]))).shape[2] == 3
+    assert [path.name for path in found] == names
+    assert np.asarray(cv2.imread(str(found[1]))).shape[2] == 3
 
 
-def test_texts_of_the_recording_are_escaped(page: Path, copy: Path) -> None:
+def test_without_truth_a_sentence_says_why_and_all_texts_are_escaped(
+    page: Path, copy: Path
+) -> None:
     evil = "</title></script><script>alert(1)</script>\"'><img onload='x'>&"
     n_scripts = Page(page.read_text()).tags.count("script")
-    rewrite_summary(copy, recording=evil, warnings=[evil], decisions=[evil], sensor=evil)
-    rewrite_summary(copy, ground_truth=f"none: {evil}", configuration={"frontend": {"kind": evil}})
+    rewrite_summary(copy, recording=evil, warnings=[evil], decisions=[evil], sensor=evil, errors=[])
+    configuration = {"frontend": {"kind": evil}, "window": {"n_links": 7, "n_keyframes": 20}}
+    rewrite_summary(copy, ground_truth=f"none: {evil}", configuration=configuration)
     (copy / "ground_truth.txt").unlink()
     rows = (copy / "frames.csv").read_text().splitlines()
     (copy / "frames.csv").write_text("\n".join([*rows[:-1], f"{rows[-1]}{evil}", ""]))
     text = page_of(copy)
     assert "<script>alert" not in text
     assert "<img onload" not in text
-    assert text.count("&lt;script&gt;alert(1)") >= 6
+    assert text.count("&lt;script&gt;alert(1)") >= 6 + len(SECTIONS[3:7])
     assert Page(text).tags.count("script") == n_scripts
+    assert Page(text).drawn == SECTIONS[:3] + SECTIONS[7:]
+    # What differs from the default is marked, with the default.
+    assert 'class="changed"' not in page.read_text()
+    marked = re.findall(r'<tr class="changed">(.*?)</tr>', text)
+    assert [re.sub("<[^>]*>", " ", row).split() for row in marked][-1] == [
+        *("n_links", "7", "default", "3"),
+    ]
 
 
 def test_names_of_estimates_are_escaped_everywhere(tmp_path: Path) -> None:
@@ -138,14 +142,6 @@ def straight(n: int, *, bend: float = 0.0) -> Trajectory:
     return Trajectory(stamps_ns=np.arange(n) * 100_000_000, T_world_frame=T)
 
 
-def test_without_truth_a_sentence_says_why(copy: Path) -> None:
-    (copy / "ground_truth.txt").unlink()
-    rewrite_summary(copy, ground_truth="none: nobody measured it", errors=[])
-    text = page_of(copy)
-    assert text.count("nobody measured it") == 1 + len(SECTIONS[3:7])
-    assert Page(text).drawn == SECTIONS[:3] + SECTIONS[7:]
-
-
 def test_positions_without_rotations_leave_out_what_needs_rotations(copy: Path) -> None:
     truth = read_run(copy).truth
     assert truth is not None
@@ -159,14 +155,12 @@ def test_positions_without_rotations_leave_out_what_needs_rotations(copy: Path) 
     assert "rotation error [deg]" not in text
 
 
-def test_the_page_begins_with_the_verdict_and_how_covariances_fit(page: Path, copy: Path) -> None:
+def test_the_page_begins_with_the_verdict_and_how_covariances_fit(page: Path) -> None:
     head = page.read_text().partition("<h2>")[0]
     assert '<p class="verdict">' in head
     assert "m in 12 frames, all tracked; " in head
     for words in ("raw over 1 s", "window over 1 s", "NEES"):
         assert words in head
-    rewrite_summary(copy, covariances=[])
-    assert "NEES" not in page_of(copy).partition("<h2>")[0]
 
 
 def test_an_interrupted_run_is_shown_as_far_as_it_went(copy: Path) -> None:
@@ -181,34 +175,6 @@ def test_an_interrupted_run_is_shown_as_far_as_it_went(copy: Path) -> None:
     assert Page(page_of(copy)).drawn == []
 
 
-def test_each_status_has_a_row_with_its_count(copy: Path) -> None:
-    rows = (copy / "frames.csv").read_text().splitlines()
-    for index, status in enumerate(("coasting", "lost", "resumed", "skipped"), start=3):
-        rows[index] = rows[index].replace(",ok,", f",{status},")
-    repeated = [rows[1].replace(",ok,", ",skipped,")] * 20  # came twice
-    (copy / "frames.csv").write_text("\n".join([*rows[:2], *repeated, *rows[2:], ""]))
-    text = page_of(copy)
-    for label in ("ok: 8", "coasting: 1", "lost: 1", "resumed: 1", "skipped: 21"):
-        assert f">{label}</text>" in text
-
-
-def test_what_differs_from_the_default_is_marked_with_the_default(page: Path, copy: Path) -> None:
-    assert 'class="changed"' not in page.read_text()
-    rewrite_summary(copy, configuration={"window": {"n_links": 7, "n_keyframes": 20}})
-    marked = re.findall(r'<tr class="changed">(.*?)</tr>', page_of(copy))
-    assert [re.sub("<[^>]*>", " ", row).split() for row in marked] == [
-        ["n_links", "7", "default", "3"]
-    ]
-
-
-def test_labels_are_text_and_keep_their_digits(page: Path, folder: Path) -> None:
-    text = page.read_text()
-    for label in ("x [m]", "z [m]", "position error [m]", "rotation error [deg]"):
-        assert f">{label}</text>" in text
-    ate_m = json.loads((folder / "summary.json").read_text())["errors"][0]["ate_m"]
-    assert f"raw (RMSE {ate_m:.3g} m)" in text
-
-
 @pytest.mark.parametrize(
     ("n_frames", "missing"),
     [
@@ -219,21 +185,3 @@ def test_labels_are_text_and_keep_their_digits(page: Path, folder: Path) -> None
 def test_few_frames_do_and_3_for_errors(n_frames: int, missing: set[str], tmp_path: Path) -> None:
     run_of(SyntheticRecording("handheld", "rgbd", n_frames=n_frames, scale=0.25), tmp_path)
     assert {*SECTIONS} - {*Page(page_of(tmp_path)).drawn} <= missing
-
-
-def test_a_long_run_gives_a_small_page(tmp_path: Path) -> None:
-    path = tmp_path / "page.html"
-    write_run_report(path, make_long_run(tmp_path, 10_000))
-    assert path.stat().st_size < 10_000_000
-    assert "lost: 10<" in path.read_text()
-
-
-def test_what_cannot_be_written_is_refused(folder: Path, tmp_path: Path) -> None:
-    record = read_run(folder)
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigurationError, match="cannot be written"):
-        write_run_report(tmp_path / "file" / "page.html", record)
-    with pytest.raises(ConfigurationError, match=r"ending in \.html, \.htm, got \.txt"):
-        write_run_report(tmp_path / "page.txt", record)
-    with pytest.raises(ValueError, match="at least one"):
-        write_comparison_report(tmp_path / "page.html", straight(3), {}, [], align="se3")

@@ -49,7 +49,7 @@ def short_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def long_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("long")
-    write_run_report(out / "report.html", make_long_run(out, 10_000))
+    write_run_report(out / "report.html", make_long_run(out, 3_500))
     return out / "report.html"
 
 
