@@ -214,8 +214,8 @@ def room_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def walk_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a bag of `tests.rendered_walk`: nothing of the robot, no truth."""
-    from tests.rendered_walk import Walk
+    """Return a bag of `tests.make.rendered_walk`: nothing of the robot, no truth."""
+    from tests.make.rendered_walk import Walk
 
     path = tmp_path_factory.mktemp("walk") / "walk.mcap"
     gvo.convert(Walk(), path)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gvo.types import Edge, Estimate, Failure, RelativePose, RgbdFrame, StereoFrame
-from tests.results import observations_of
+from tests.make.results import observations_of
 
 
 def grey(*shape: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:

@@ -19,7 +19,7 @@ from gvo.io.convert.convert import convert
 from gvo.io.recording import Sensor, Source
 from gvo.io.synthetic import SyntheticRecording
 from gvo.types import FloatArray, RgbdFrame, StereoFrame
-from tests.recordings import Held, hold
+from tests.make.recordings import Held, hold
 
 pytestmark = pytest.mark.acceptance
 

@@ -12,7 +12,7 @@ import pytest
 from gvo import Config, FrameResult, Odometry, SyntheticRecording, frames
 from gvo.geometry import se3
 from gvo.types import FloatArray, RgbdFrame, Status, StereoFrame
-from tests.recordings import Held
+from tests.make.recordings import Held
 from tests.worlds import KINDS
 from tests.worlds.deceptive import traffic
 

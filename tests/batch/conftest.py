@@ -20,7 +20,7 @@ import gvo
 from gvo.batch import BatchOptions
 from gvo.io.synthetic import SyntheticRecording
 from tests.conftest import GVO
-from tests.recordings import Held, hold
+from tests.make.recordings import Held, hold
 
 N_FRAMES = 8
 # Long enough to be stopped in the middle, also where the machine is busy.

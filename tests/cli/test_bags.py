@@ -20,7 +20,7 @@ from gvo.trajectory.formats import read_trajectory
 from gvo.types import FloatArray, IntArray
 from tests.conftest import Command, assert_same_files, refused
 from tests.make.bags import ODOMETRY, PoseBag
-from tests.rendered_walk import (
+from tests.make.rendered_walk import (
     CAMERA,
     GLOBAL,
     LEFT,

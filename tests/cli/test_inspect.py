@@ -29,7 +29,7 @@ from tests.conftest import (
     refused,
     start,
 )
-from tests.rendered_walk import read_bag
+from tests.make.rendered_walk import read_bag
 from tests.viz.explanation.test_explanation import DESCRIPTORS, TRACKS
 
 COMMANDS = (

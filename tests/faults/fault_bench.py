@@ -24,7 +24,7 @@ from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
 from tests.conftest import run_of
 from tests.faults.catalogue import NamedFault
-from tests.recordings import Held, hold
+from tests.make.recordings import Held, hold
 
 _SCALE = 0.4
 

@@ -44,7 +44,7 @@ from gvo.types import (
     StereoFrame,
 )
 from tests.geometry.scenes import move, project, unproject
-from tests.recordings import frames_of
+from tests.make.recordings import frames_of
 
 N_FRAMES = 20
 CAMERA = StereoCamera(fx=525.0, fy=520.0, cx=319.5, cy=239.5, width=640, height=480, baseline=0.1)

@@ -18,7 +18,7 @@ from gvo.frontend.tracking import track_pixels
 from gvo.geometry import se3
 from gvo.io.recording import Sensor
 from gvo.types import Failure, FloatArray, Frame, MotionPrior, RelativePose, RgbdFrame, StereoFrame
-from tests.recordings import frames_of
+from tests.make.recordings import frames_of
 
 N_FRAMES = 6
 SENSORS: list[Sensor] = ["stereo", "rgbd"]

@@ -16,7 +16,7 @@ from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.types import Failure, FloatArray, IntArray, MotionPrior, Observations, RelativePose
-from tests.results import observations_of
+from tests.make.results import observations_of
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
 CAMERA = StereoCamera(fx=500.0, fy=480.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.2)

@@ -8,7 +8,7 @@ from hypothesis import given
 from gvo.geometry.correspondences import Correspondences
 from gvo.types import FloatArray
 from tests.geometry.scenes import CAMERA, seeds, unproject
-from tests.results import observations_of
+from tests.make.results import observations_of
 
 
 def random_pixels(rng: np.random.Generator, n: int) -> FloatArray:

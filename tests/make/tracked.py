@@ -14,7 +14,7 @@ from gvo.io.synthetic import SyntheticRecording, WorldName
 from gvo.odometry.odometry import Odometry
 from gvo.runs.outputs.frames import RunFrames
 from gvo.types import Estimate, FloatArray, Frame, FrameResult
-from tests.recordings import frames_of
+from tests.make.recordings import frames_of
 
 N_FRAMES = 12
 SECOND_NS = 10**9

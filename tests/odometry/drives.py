@@ -13,7 +13,7 @@ from gvo.geometry.camera import StereoCamera
 from gvo.odometry.graph import RunGraph
 from gvo.odometry.loops import LoopDetector
 from gvo.types import Edge, Failure, FloatArray, Loop, Optimum, RelativePose
-from tests.results import estimate_at
+from tests.make.results import estimate_at
 
 Rng: TypeAlias = np.random.Generator | None
 # Of the length of a motion, and of its turn: radians per metre.

@@ -14,7 +14,7 @@ from gvo.frontend.protocol import CheckedFrontend
 from gvo.geometry import se3
 from gvo.odometry.chain import RawChain, RawStep
 from gvo.types import Failure, FloatArray, MotionPrior, Observations, RelativePose, Status
-from tests.results import observations_of
+from tests.make.results import observations_of
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
 STEP_NS = 100_000_000

@@ -15,7 +15,7 @@ from gvo.io.run_folder.writer import RunFolder
 from gvo.odometry.chain import EdgeChain
 from gvo.runs.smooth import POSES_HEADER, Smoother
 from gvo.types import Edge, Estimate, FloatArray, PosePrior, Status
-from tests.results import estimate_at
+from tests.make.results import estimate_at
 
 SECOND = 1_000_000_000
 

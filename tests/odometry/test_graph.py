@@ -22,6 +22,7 @@ from gvo.geometry import se3
 from gvo.odometry.graph import RunGraph
 from gvo.odometry.loops import LoopDetector
 from gvo.types import Edge, FloatArray, Loop, Optimum, PosePrior, Status
+from tests.make.results import estimate_at
 from tests.odometry.drives import (
     PERIOD_NS,
     SIGMAS,
@@ -34,7 +35,6 @@ from tests.odometry.drives import (
     poses,
     position_error,
 )
-from tests.results import estimate_at
 
 N_LAP = 100
 

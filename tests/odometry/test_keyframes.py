@@ -11,7 +11,7 @@ from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.odometry.keyframes import Keyframes, misclosure
 from gvo.types import Edge, Estimate, FloatArray, Observations
-from tests.results import observations_of
+from tests.make.results import observations_of
 
 CAMERA = StereoCamera(fx=100.0, fy=100.0, cx=50.0, cy=40.0, width=100, height=80, baseline=0.1)
 

@@ -12,6 +12,7 @@ from gvo.geometry import se3
 from gvo.odometry.graph import RunGraph
 from gvo.odometry.loops import LoopDetector
 from gvo.types import Edge, Failure, FloatArray, Optimum, RelativePose, Status
+from tests.make.results import estimate_at
 from tests.odometry.drives import (
     PERIOD_NS,
     SIGMAS,
@@ -22,7 +23,6 @@ from tests.odometry.drives import (
     poses,
     position_error,
 )
-from tests.results import estimate_at
 
 N_LAP = 100
 # Dark frames; the guess is wrong by far from the first one on.

@@ -19,8 +19,8 @@ from gvo.io.synthetic import SyntheticRecording
 from gvo.odometry.odometry import Odometry
 from gvo.runs.loop import RunLoop, edge_over
 from gvo.types import Edge, Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Optimum, Progress
-from tests.recordings import Held, hold
-from tests.rendered_walk import CAMERA, T_BASE_CAM, moved_by_hand
+from tests.make.recordings import Held, hold
+from tests.make.rendered_walk import CAMERA, T_BASE_CAM, moved_by_hand
 
 _N_FRAMES = 7
 

@@ -27,7 +27,7 @@ from gvo.types import Optimum, Progress
 from tests import faults as made
 from tests.conftest import Command, run_of
 from tests.make.bags import PoseBag
-from tests.rendered_walk import (
+from tests.make.rendered_walk import (
     CAMERA,
     GLOBAL,
     N_FRAMES,

@@ -4,7 +4,7 @@ import pytest
 
 from gvo.runs.statistics import RunStatistics
 from gvo.types import FaultyFrame, SegmentJoin, Status
-from tests.results import estimate_at, result_of
+from tests.make.results import estimate_at, result_of
 
 
 def counted(n_ok: int, n_coasting: int) -> RunStatistics:

@@ -17,7 +17,7 @@ from gvo.geometry import se3
 from gvo.io.recording import Sensor
 from gvo.testing import ContractError, check_frontend
 from gvo.types import Failure, FloatArray, Frame, MotionPrior, Observations, RelativePose
-from tests.recordings import frames_of
+from tests.make.recordings import frames_of
 
 Result = RelativePose | Failure
 

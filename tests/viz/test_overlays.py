@@ -23,7 +23,7 @@ from gvo.viz.overlay import (
     text_width,
 )
 from gvo.viz.scene import loop_text
-from tests.results import estimate_at, loop_of, result_of
+from tests.make.results import estimate_at, loop_of, result_of
 
 _GREY = np.random.default_rng(0).integers(60, 120, (80, 120), dtype=np.uint8)
 _pixels = st.tuples(st.floats(-30, 150), st.floats(-30, 110))

@@ -20,7 +20,7 @@ from gvo.viz.scene import (
     position_sigmas,
     scene,
 )
-from tests.results import estimate_at, loop_of
+from tests.make.results import estimate_at, loop_of
 from tests.viz.view.fakes import PERIOD_NS, pose_of, registration_of, result_of
 
 

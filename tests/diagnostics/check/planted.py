@@ -11,7 +11,7 @@ from gvo.config import Config
 from gvo.diagnostics.check import CheckResult, Finding, check_recording
 from gvo.io.recording import Sensor, Source
 from gvo.io.synthetic import SyntheticRecording, WorldName
-from tests.recordings import Held, hold
+from tests.make.recordings import Held, hold
 
 N_FRAMES = 26
 

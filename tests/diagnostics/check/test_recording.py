@@ -20,7 +20,7 @@ from gvo.io.opening import open_recording
 from gvo.testing import FaultySource
 from tests import faults as made
 from tests.diagnostics.check.planted import check, complaints, find, render
-from tests.recordings import Held
+from tests.make.recordings import Held
 
 Fault = made.Fault | Callable[[Held], Held]
 

@@ -10,7 +10,7 @@ from gvo.diagnostics.check import Finding, check_recording
 from gvo.io.recording import Sensor
 from gvo.io.synthetic import SyntheticRecording
 from tests.diagnostics.check.planted import render
-from tests.recordings import Held
+from tests.make.recordings import Held
 
 PLANTED_MS = 25.0
 

@@ -15,7 +15,7 @@ from gvo.diagnostics.check import Finding
 from gvo.geometry.camera import Calibration, PinholeCamera
 from gvo.io.recording import RecordingInfo, StampedImage
 from tests.diagnostics.check.planted import check, complaints, find, render
-from tests.recordings import Held
+from tests.make.recordings import Held
 
 MS = 1_000_000
 PERIOD_NS = 33_333_333

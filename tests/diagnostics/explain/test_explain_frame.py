@@ -21,7 +21,7 @@ from gvo.trajectory.formats import write_tum
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FrameResult, Progress
 from tests.make.explained import KINDS, LAST, configuration, explained, recording
-from tests.recordings import Held, frames_of, hold
+from tests.make.recordings import Held, frames_of, hold
 
 SENSORS: tuple[Sensor, ...] = ("stereo", "rgbd")
 EACH = pytest.mark.parametrize(("kind", "sensor"), [*product(KINDS, SENSORS)])

@@ -16,7 +16,7 @@ from gvo.io.poses.tf import TfBuffer
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Edge, Estimate, FloatArray
 from tests.make.bags import add_transform
-from tests.results import estimate_at
+from tests.make.results import estimate_at
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
 STAMPS_NS = [1_700_000_000_000_000_000 + n * 100_000_000 for n in range(6)]

@@ -17,7 +17,7 @@ from gvo.trajectory.formats import write_tum
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure
 from tests.make.bags import ODOMETRY, TRANSFORM, PoseBag
-from tests.rendered_walk import (
+from tests.make.rendered_walk import (
     CAMERA,
     STAMPS_NS,
     START_NS,

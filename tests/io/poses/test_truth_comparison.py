@@ -17,7 +17,7 @@ from gvo.io.poses.truth import Truth, TruthComparison
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
 from tests.make.bags import ODOMETRY, STAMPED, TRANSFORM, WITH_COVARIANCE, PoseBag
-from tests.rendered_walk import (
+from tests.make.rendered_walk import (
     STAMPS_NS,
     T_BASE_CAM,
     Walk,

@@ -33,6 +33,8 @@ from gvo.types import (
     StereoFrame,
 )
 from gvo.viz.scene import N_SHOWN_POSES
+from tests.make.rendered_walk import read_bag
+from tests.make.results import estimate_at, loop_of, optimum_of, result_of
 from tests.make.tracked import (
     MOUNTED,
     N_FRAMES,
@@ -44,8 +46,6 @@ from tests.make.tracked import (
     moved,
     tracked,
 )
-from tests.rendered_walk import read_bag
-from tests.results import estimate_at, loop_of, optimum_of, result_of
 
 _KINDS = pytest.mark.parametrize("name", ["run.mcap", "run.bag"])
 _ESTIMATES = ("raw", "causal", "smoothed")

@@ -10,7 +10,7 @@ from gvo.errors import ConfigurationError
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.runs.outputs.options import name_frames
 from tests.conftest import run_of
-from tests.rendered_walk import CAMERA, T_BASE_CAM, Walk
+from tests.make.rendered_walk import CAMERA, T_BASE_CAM, Walk
 
 
 def test_the_bag_of_a_run_names_the_frames_of_the_recording(walk_bag: Path) -> None:

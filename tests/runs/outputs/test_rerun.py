@@ -39,8 +39,8 @@ from gvo.types import (
     StereoFrame,
 )
 from gvo.viz.palette import COUNTS, LINKS, STAGES
+from tests.make.results import estimate_at, loop_of, optimum_of, result_of
 from tests.make.tracked import MOUNTED, N_FRAMES, START_NS, moved
-from tests.results import estimate_at, loop_of, optimum_of, result_of
 
 pytestmark = pytest.mark.rerun
 

@@ -14,8 +14,8 @@ from gvo.io.synthetic import WorldName
 from gvo.runs.outputs.video import RunOverlay, film_width
 from gvo.types import FaultyFrame, ImageArray
 from gvo.viz.overlay import compose_faulty, compose_overlay
+from tests.make.results import loop_of
 from tests.make.tracked import N_FRAMES, Tracked, tracked
-from tests.results import loop_of
 
 
 @pytest.fixture(scope="module")

@@ -20,8 +20,8 @@ from gvo.types import (
     StereoFrame,
 )
 from gvo.viz.view.newest import Newest
-from tests.results import estimate_at
-from tests.results import result_of as made_up
+from tests.make.results import estimate_at
+from tests.make.results import result_of as made_up
 
 PERIOD_NS = 100_000_000
 CAMERA = StereoCamera(width=160, height=120, fx=120.0, fy=120.0, cx=80.0, cy=60.0, baseline=0.1)

@@ -22,8 +22,8 @@ from gvo.viz.view.newest import FrameView
 from gvo.viz.view.page import Page
 from gvo.viz.view.player import Player
 from gvo.viz.view.server import ViewServer
-from tests.recordings import Held
-from tests.results import loop_of
+from tests.make.recordings import Held
+from tests.make.results import loop_of
 from tests.viz.view.fakes import (
     CAMERA,
     PERIOD_NS,

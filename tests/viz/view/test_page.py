@@ -20,7 +20,7 @@ from gvo.viz.view import serve
 from gvo.viz.view.page import Page, truth_positions
 from gvo.viz.view.player import Player
 from gvo.viz.view.server import ViewServer
-from tests.results import estimate_at, loop_of
+from tests.make.results import estimate_at, loop_of
 from tests.viz.view.fakes import (
     PERIOD_NS,
     FakePlayer,
