@@ -1,16 +1,9 @@
 """Plant small faults in the code, one at a time, and count those that make a test fail.
 
-Each mutant replaces one node of the syntax tree inside of a function:
-a comparison by its neighbour or its opposite; + by -, * by /, `and` by `or`, likewise others; the
-operands of @ swapped; not and minus dropped, a condition negated; a number by one more; minimum by
-maximum and the like; a call, an assignment to an element or a raise left out; break by continue;
-None returned; a keyword argument left out.
-
-Messages, docstrings, annotations and decorators stay. The tests are collected once and run once to
-find which lines each of them reaches. Each mutant is then a fork in which the code of one function
-is replaced; it runs the tests that reach the changed lines, quick ones first, until one fails or
-takes ten times its processor time. What no test reaches survives. The survivors are printed, then
-the share that was killed, with the 95 % interval for all mutants (Wilson's).
+Each mutant replaces one node of the syntax tree inside of a function, as `_faults` says. All tests
+are run once to find which lines each reaches. Each mutant is then a fork in which the code of one
+function is replaced: it runs the tests that reach the changed lines, quick ones first, until one
+fails or takes ten times its processor time. The interval printed is Wilson's, at 95 %.
 
 Example: python tests/quality/mutation.py --sample 200 --seed 0 --jobs 2
 """
@@ -40,10 +33,8 @@ from scipy.stats import binomtest
 ROOT = Path(__file__).resolve().parents[2]
 PATHS = ("gvo/geometry", "gvo/backend", "gvo/kernels", "gvo/trajectory", "gvo/io/sync.py")
 TESTS = ("tests/geometry", "tests/backend", "tests/kernels", "tests/trajectory", "tests/io")
-MIN_KILLED = 0.9
-UNUSABLE = 3
-SPARE_S = 5.0
-PATIENCE = 10.0
+MIN_KILLED, UNUSABLE = 0.9, 3
+SPARE_S, PATIENCE = 5.0, 10.0
 
 _NEIGHBOURS: dict[type[ast.AST], tuple[type[Any], ...]] = {
     ast.Lt: (ast.LtE, ast.GtE), ast.LtE: (ast.Lt, ast.Gt), ast.Gt: (ast.GtE, ast.LtE),
@@ -55,7 +46,6 @@ _NEIGHBOURS: dict[type[ast.AST], tuple[type[Any], ...]] = {
 }  # fmt: skip
 _SWAPS = ("minimum maximum", "min max", "any all", "argmin argmax", "zeros ones", "sin cos")
 _NAMES = {a: b for pair in _SWAPS for a, b in (pair.split(), pair.split()[::-1])}
-_FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 _UNTOUCHED = {"annotation", "returns", "decorator_list"}
 _CONDITIONS = (ast.Name, ast.Attribute, ast.Call, ast.NamedExpr, ast.Subscript)
 _HARMLESS = {"reason", "encoding", "newline", "strict"}
@@ -106,7 +96,7 @@ def mutants_of(path: Path) -> Iterator[Mutant]:
 def _functions(node: ast.AST, names: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
     """Yield the outermost functions and methods with their qualified names."""
     for child in ast.iter_child_nodes(node):
-        if isinstance(child, _FUNCTIONS):
+        if isinstance(child, ast.FunctionDef):
             yield (*names, child.name), child
         elif isinstance(child, ast.ClassDef):
             yield from _functions(child, (*names, child.name))
