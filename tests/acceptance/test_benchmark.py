@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 import gvo
-from gvo.geometry import se3
 from gvo.io.recording import Source
 from gvo.testing.faults import Black, FaultySource
-from gvo.types import FaultyFrame, Loop
-from scripts.benchmarks import loops, recordings
+from gvo.types import FaultyFrame
+from scripts.benchmarks import recordings
 from tests import worlds
 from tests.acceptance.conftest import Script
 from tests.conftest import run_of
@@ -23,9 +22,6 @@ pytestmark = pytest.mark.acceptance
 
 ROOT = Path(__file__).parents[2]
 N_FRAMES = 34  # just over a second, which the NEES needs
-SIGMAS = np.diag([0.01] * 3 + [0.1] * 3)  # rad, m
-
-
 Benchmark = Callable[..., str]
 
 
@@ -162,60 +158,6 @@ def test_whole_runs_of_two_versions_take_turns(
         f"{who} {what}" for what in (run, "demo --out") for _ in "12" for who in ("own", "other")
     ]
     assert log.read_text().splitlines() == words
-
-
-def round_trip() -> gvo.Trajectory:
-    """Return two rounds of 20 s on a circle of 10 m, then half of one the other way round."""
-    turns = (
-        2.0 * np.pi * np.concatenate([np.arange(0.0, 2.0, 0.05), 2.0 - np.arange(0.0, 0.5, 0.05)])
-    )
-    T = se3.exp(np.outer(turns, [0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
-    T[:, :3, 3] = 10.0 * np.column_stack([np.cos(turns), np.sin(turns), 0.0 * turns])
-    T[40:] = T[40:] @ se3.exp(np.array([0.0, 0.0, np.pi, 0.0, 0.0, 0.0]))
-    stamps_ns = 1_000_000_000 * np.arange(len(T))
-    return gvo.Trajectory(stamps_ns=stamps_ns, T_world_frame=T)
-
-
-def test_a_visit_is_a_place_seen_before_from_the_same_side() -> None:
-    earlier, later = loops.visits(round_trip())
-    np.testing.assert_array_equal(later, np.arange(20, 40))
-    np.testing.assert_array_equal(earlier, np.arange(20))
-
-
-def test_loops_are_counted_by_what_the_truth_says() -> None:
-    truth = round_trip()
-    # Three accepted, of which one is unlikely and one wrong, and two refused.
-    noises = np.zeros((5, 6))
-    noises[:, 5] = 0.1, 0.45, 0.0, 3.0, 0.2
-    noises[2, 1] = 0.1
-    found = [
-        Loop(
-            stamp_ns=(20 + k) * 10**9,
-            reference_ns=k * 10**9,
-            T_reference_frame=se3.invert(truth.T_world_frame[k])
-            @ truth.T_world_frame[20 + k]
-            @ se3.exp(noise),
-            covariance=SIGMAS**2 / (1.0 + k),
-            n_matches=50,
-            n_inliers=40,
-            reason="lonely" if k > 2 else "",
-        )
-        for k, noise in enumerate(noises)
-    ]
-    assert loops.of_loops(truth, found) == [5, 2, 3, 1, 2]
-    # A loop whose truth is not known is not judged.
-    assert loops.of_loops(truth.select(slice(1, None)), found) == [4, 2, 2, 1, 2]
-
-
-def test_the_light_goes_out_and_the_lens_breathes() -> None:
-    room = gvo.SyntheticRecording("handheld", n_frames=12, scale=0.1)
-    dark = loops.darkened(room, (0.1, 0.3))
-    left = [image.load().any() for image in dark.images() if image.stream == 0]
-    assert np.flatnonzero(~np.array(left)).tolist() == list(range(3, 9))
-    assert loops.drifting(room, 0.0) is room
-    *_, last = room.images()
-    *_, breathing = loops.drifting(room, 5.0).images()
-    assert (last.load() != breathing.load()).any()
 
 
 def test_global_poses_are_judged_as_the_runs_tell_them(
