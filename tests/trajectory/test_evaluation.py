@@ -287,18 +287,6 @@ def test_against_positions_the_place_is_measured_and_no_rotation() -> None:
         assert (bare.n_segments, bare.reference_share, bare.path_ratio) == (0, 1.0, full.path_ratio)
 
 
-def test_a_truth_of_one_fix_a_second_measures_the_drive() -> None:
-    """No stamp of a fix is that of a frame; association within 10 ms would find none."""
-    reference = drive(600, 0.5)
-    fixes = reference.interpolate(reference.stamps_ns[0] + 10**9 * np.arange(60) + 47_000_000)
-    points = Trajectory.of_positions(fixes.stamps_ns, fixes.positions, stamps_from="topic")
-    estimate = disturbed(reference)
-    found = evaluate(points, estimate, name="e")
-    assert found.n == 60
-    assert found.ate_m == pytest.approx(evaluate(reference, estimate, name="e").ate_m, rel=0.05)
-    np.testing.assert_array_equal(found.stamps_ns, fixes.stamps_ns)
-
-
 def shaken(*, noise_m: float = 0.0, seed: int = 0) -> Trajectory:
     """Return 300 poses of a camera in a shaking hand; their own noise is independent."""
     phases = np.outer(np.arange(300), [0.31, 0.23, 0.17])

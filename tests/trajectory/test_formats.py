@@ -80,16 +80,6 @@ def test_poses_have_the_covariances_of_the_file_beside_them(tmp_path: Path) -> N
         assert read_trajectory(tmp_path / "smoothed.txt").covariances is None
 
 
-def test_an_empty_covariance_file_reads_as_none(tmp_path: Path) -> None:
-    path = tmp_path / "covariances.csv"
-    path.write_text(COVARIANCE_HEADER + "\n")
-    stamps_ns, covariances = read_covariances(path)
-    assert (stamps_ns.shape, covariances.shape) == ((0,), (0, 6, 6))
-    path.write_text("1,2,3\n")
-    with pytest.raises(TrajectoryError, match="expected the header"):
-        read_covariances(path)
-
-
 @given(seeds)
 def test_a_line_has_nine_decimals_of_the_stamp_and_no_negative_w(seed: int) -> None:
     T = se3.exp(np.random.default_rng(seed).normal(size=6) * 3)
@@ -175,22 +165,15 @@ def test_kitti_poses_take_stamps_of_a_file_of_as_many_rows(tmp_path: Path, place
     ("text", "match"),
     [
         ("", "holds no poses"),
-        ("# only\n# comments\n", "holds no poses"),
         (GOOD + "hello world\n", r":2: expected 8 columns, got 2"),
         ("hello world\n", r":1: expected 8 columns \(TUM.*got 2"),
         (GOOD + "2 0 0 x 0 0 0 1\n", r":2: could not convert.*'x'.*expected 8 numbers"),
         (GOOD + "2 0 0 0_100000 0 0 0 1\n", r":2: '0_100000' is no decimal number"),
-        (GOOD + "2 0 0 \u0663 0 0 0 1\n", r":2: '\u0663' is no decimal number"),
-        (GOOD + "1_0 0 0 0 0 0 0 1\n", r":2: the stamp '1_0' is no number"),
         (GOOD + "\u0662 0 0 0 0 0 0 1\n", r":2: the stamp '\u0662' is no number"),
-        (GOOD + "two 0 0 0 0 0 0 1\n", r":2: the stamp 'two' is no number"),
         (GOOD + "nan 0 0 0 0 0 0 1\n", r":2: the stamp 'nan' is out of range"),
         ("1403636579763555584 0 0 0 0 0 0 1\n", r":1: .*out of range; expected seconds"),
-        ("1e999999999999 0 0 0 0 0 0 1\n", r":1: the stamp"),
         (GOOD + "2 0 0 nan 0 0 0 1\n", r":2: a number is not finite"),
-        (GOOD + "2 0 inf 0 0 0 0 1\n", r":2: a number is not finite"),
         (GOOD + "2 0 0 0 0 0 0 0\n", r":2: the quaternion is not of length one"),
-        (GOOD + "2 0 0 0 0 0 1 1\n", r":2: the quaternion is not of length one"),
         (GOOD + "\n0.5 0 0 0 0 0 0 1\n", r":3: the stamp 0.50+ is not after 1.0+ of line 1"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 1 0 0 0 0 0 0\n", r":2: the first three.*rotation"),
         ("1 0 0 0 0 1 0 0 0 0 -1 0\n", r":1: the first three columns.*rotation"),
@@ -217,13 +200,6 @@ def test_what_is_no_text_file_is_refused(tmp_path: Path) -> None:
     ]:
         with pytest.raises(TrajectoryError, match=match):
             read_trajectory(path)
-
-
-def test_a_folder_that_is_missing_is_named_when_writing(tmp_path: Path) -> None:
-    trajectory = random_trajectory(0)
-    for write in (write_tum, write_kitti):
-        with pytest.raises(TrajectoryError, match=r"nowhere.*cannot be written: No such file"):
-            write(tmp_path / "nowhere" / "file.txt", trajectory)
 
 
 @pytest.mark.recorded

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from gvo.geometry import se3
 from gvo.trajectory.g2o import (
-    Fix,
     Measurement,
     Vertex,
     convert_line,
@@ -83,18 +82,6 @@ def test_a_converted_line_says_the_same(seed: int) -> None:
     assert isinstance(after, Measurement)
     np.testing.assert_allclose(after.T_reference_frame, before.T_reference_frame, atol=1e-14)
     np.testing.assert_allclose(after.covariance, before.covariance, rtol=1e-12, atol=1e-15)
-
-
-def test_an_edge_of_the_older_form_without_information_has_unit_covariance() -> None:
-    edge = parse_line("EDGE3 0 1 1 2 3 0 0 0")
-    assert isinstance(edge, Measurement)
-    np.testing.assert_array_equal(edge.covariance, np.eye(6))
-
-
-def test_fixed_poses_are_listed() -> None:
-    line = parse_line("FIX 3 5  # both")
-    assert isinstance(line, Fix)
-    assert line.frame_ids == (3, 5)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from gvo.geometry import se3
 from gvo.trajectory.trajectory import Trajectory, format_stamp
 from gvo.types import FloatArray
-from tests.trajectory.paths import random_trajectory, seeds, still, unturned
+from tests.trajectory.paths import random_trajectory, seeds, unturned
 
 
 def test_arrays_are_copies_that_nobody_can_write_to() -> None:
@@ -31,11 +31,6 @@ def at(place: tuple[int, int, int], value: float) -> FloatArray:
     array = np.zeros((3, 4, 4))
     array[place] = value
     return array
-
-
-def test_a_trajectory_may_be_empty() -> None:
-    empty = still([])
-    assert len(empty) == len(empty.distances()) == len(empty.interpolate(np.array([1]))) == 0
 
 
 @pytest.mark.parametrize(
