@@ -175,18 +175,3 @@ def test_unknown_depth_stays_unknown_and_moves_with_what_surrounds_it() -> None:
     expected = np.full((480, 640), np.nan, np.float32)
     expected[:, 10:] = depth[:, :-10]  # 10.2 pixels to the right
     np.testing.assert_array_equal(registered, expected)
-
-
-def test_points_behind_the_colour_camera_are_left_out() -> None:
-    T_color_depth = make_transform(np.eye(3), np.array([0.0, 0.0, -1.0]))
-    depth = np.full((480, 640), 0.5, np.float32)
-    assert np.all(np.isnan(_registration(_COLOR, T_color_depth)(depth)))
-
-
-def test_wrong_use_is_refused() -> None:
-    registration = _registration(_COLOR, make_transform(np.eye(3), np.array([0.03, 0, 0])))
-    with pytest.raises(ValueError, match=r"shape \(480, 640\), got \(240, 320\)"):
-        registration(np.ones((240, 320), np.float32))
-    for T in (2.0 * np.eye(4), np.full((4, 4), np.nan)):
-        with pytest.raises(ValueError, match=r"T_color_depth (must have|is not finite)"):
-            _registration(_COLOR, T)

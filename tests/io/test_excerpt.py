@@ -41,11 +41,6 @@ def _stamp_ns(item: Pair | FaultyFrame) -> int:
     return item.stamp_ns if isinstance(item, FaultyFrame) else item[0].stamp_ns
 
 
-def _seconds(items: Iterable[Pair | FaultyFrame]) -> list[float]:
-    """Return the stamps since the first one, seconds."""
-    return [round((_stamp_ns(item) - _FIRST_NS) / _SECOND, 6) for item in items]
-
-
 _TENTHS = [n / 10 for n in range(50)]
 _recordings = st.lists(st.tuples(st.integers(1, 300), st.booleans()), min_size=1, max_size=40).map(
     lambda steps: [
@@ -55,13 +50,6 @@ _recordings = st.lists(st.tuples(st.integers(1, 300), st.booleans()), min_size=1
         )
     ]
 )
-
-
-def test_all_is_kept_by_default() -> None:
-    items = [_item(5), _item(3, is_pair=False), _item(9)]
-    assert Excerpt().is_everything
-    assert list(take_excerpt(items, Excerpt())) == items
-    assert list(take_excerpt([], Excerpt())) == []
 
 
 @given(items=_recordings, cut=st.integers(1, 100), every=st.integers(1, 5))
@@ -123,26 +111,11 @@ def test_reading_ends_when_both_streams_are_past_the_end(lag: int) -> None:
     assert n_read == 31 + lag
 
 
-def test_a_wrong_stamp_without_partner_does_not_end_the_excerpt() -> None:
-    items = [*_items([0, 0.1]), _item(_FIRST_NS + 99 * _SECOND, is_pair=False), *_items([0.2, 5])]
-    assert _seconds(take_excerpt(items, Excerpt(duration_s=1))) == [0, 0.1, 0.2]
-
-
-def test_without_a_start_nothing_is_left_out_at_the_beginning() -> None:
-    items = [*_items([0]), _item(_FIRST_NS - _SECOND, is_pair=False), *_items([0.5])]
-    assert _seconds(take_excerpt(items, Excerpt(duration_s=1))) == [0, -1, 0.5]
-
-
 def test_an_excerpt_after_the_end_tells_how_long_the_recording_is() -> None:
     with pytest.raises(RecordingError, match=r"no frame at 60 s or later: .* is 4\.9 s long"):
         list(take_excerpt(_items(_TENTHS), Excerpt(start_s=60)))
     with pytest.raises(RecordingError, match=r"no frame at 5 s or later: .* is 4\.9 s long"):
         list(take_excerpt(_items(_TENTHS), Excerpt(start_s=5, duration_s=10)))
-
-
-def test_an_excerpt_in_a_gap_tells_where_the_recording_goes_on() -> None:
-    with pytest.raises(RecordingError, match=r"between 3 and 3\.5 s: .* goes on to 8 s"):
-        list(take_excerpt(_items([0, 1, 2, 8]), Excerpt(start_s=3, duration_s=0.5)))
 
 
 @pytest.mark.parametrize(
@@ -166,8 +139,3 @@ def test_numbers_out_of_range_are_refused(options: dict[str, Any]) -> None:
 def test_the_expected_number_is_that_of_an_even_recording(excerpt: Excerpt) -> None:
     n_taken = len(list(take_excerpt(_items(_TENTHS), excerpt)))
     assert excerpt.n_expected(len(_TENTHS), length_s=5.0) == n_taken
-
-
-def test_a_start_after_the_end_lets_nothing_be_expected() -> None:
-    assert Excerpt(start_s=9.0).n_expected(100, length_s=5.0) == 0
-    assert Excerpt(start_s=9.0, every=10).n_expected(100) == 10

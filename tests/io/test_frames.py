@@ -4,7 +4,6 @@ import json
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -99,19 +98,6 @@ def test_the_tolerances_are_those_of_the_configuration(tiny: Any) -> None:
     assert isinstance(_read(rgbd, max_difference_ms=19.9)[0], FaultyFrame)
 
 
-def test_raw_images_are_rectified(tiny: Any) -> None:
-    ideal = Calibration.from_camera(tiny.camera)
-    D = np.array([-0.2, 0.05, 0.001, -0.001, 0.0])
-    raw = replace(ideal, D=D, is_rectified=False)
-    right = replace(Calibration.from_camera(tiny.camera, baseline=0.5), D=D, is_rectified=False)
-    ramp = np.tile(np.arange(48, dtype=np.uint8) * 5, (32, 1))
-    (frame,) = _read(tiny.stereo([(0, 0, ramp), (1, 0, ramp)], calibrations=(raw, right)))
-    expected = np.asarray(cv2.undistort(ramp, raw.K, D), dtype=np.float64)
-    assert np.abs(frame.left - expected).max() <= 1.0
-    np.testing.assert_array_equal(frame.left, frame.right)
-    assert not np.array_equal(frame.left, ramp)
-
-
 def _written(path: Path, tiny: Any, **changes: Any) -> Path:
     D = {"distortion_coefficients": {"data": [-0.2, 0.05, 0.001, -0.001, 0.0]}}
     path.write_text(json.dumps(tiny.ros_camera(**(D | changes))))
@@ -202,17 +188,6 @@ def test_depth_of_a_camera_of_its_own_is_registered(tiny: Any, threads: int) -> 
     np.testing.assert_array_equal(frame.image, tiny.texture(1))
 
 
-def test_the_size_of_depth_is_checked_against_its_own_camera(tiny: Any) -> None:
-    source = tiny.rgbd([(0, 5, tiny.texture(1)), (1, 5, tiny.depth(1))])
-    source.info = replace(source.info, depth_view=_seen_from_beside())
-    (faulty,) = _read(source)
-    assert isinstance(faulty, FaultyFrame)
-    assert faulty.reason == (
-        "depth image: expected 24x16 pixels by the calibration, got 48x32; give the "
-        "calibration of these images (--calibration FILE)"
-    )
-
-
 @_THREADS
 def test_what_was_read_before_a_recording_breaks_is_delivered(tiny: Any, threads: int) -> None:
     source = tiny.stereo([(s, n, tiny.texture(n)) for n in range(3) for s in (0, 1)])
@@ -227,29 +202,6 @@ def test_what_was_read_before_a_recording_breaks_is_delivered(tiny: Any, threads
     assert [next(iterator).stamp_ns for _ in range(3)] == [0, 1, 2]
     with pytest.raises(RecordingError, match="truncated"):
         next(iterator)
-
-
-@pytest.mark.parametrize("threads", [2, 3])
-def test_an_image_that_no_thread_has_begun_is_not_waited_for(tiny: Any, threads: int) -> None:
-    """The left image is decoded only after the right one: its thread, the second, waits for it."""
-    source = tiny.stereo([(s, 0, tiny.texture(s)) for s in (0, 1)])
-    whole, is_right_loaded, found = source.images, threading.Event(), []
-
-    def load_left(image: StampedImage) -> Any:
-        found.append(is_right_loaded.wait(60.0))
-        return image.load()
-
-    def load_right(image: StampedImage) -> Any:
-        is_right_loaded.set()
-        return image.load()
-
-    def holding() -> Iterator[StampedImage]:
-        for image in whole():
-            yield replace(image, load=partial((load_left, load_right)[image.stream], image))
-
-    source.images = holding
-    assert len(_read(source, threads)) == 1
-    assert found == [True]
 
 
 @pytest.mark.parametrize("is_closed", [True, False])
@@ -299,24 +251,6 @@ def test_a_single_repeat_is_let_through_as_drivers_give_it_now_and_then() -> Non
     assert _kept(_pairs((_A, _B), (_C, _D), (_A, _B), (_C, _D))) == [True] * 4
 
 
-def test_what_waits_is_given_before_an_error() -> None:
-    def read() -> Iterator[Frame | FaultyFrame]:
-        yield from _pairs((_A, _B), (_A, _B))
-        raise RecordingError("cut off")
-
-    frames = refuse_repeats(read(), ("left", "right"))
-    assert [next(frames).stamp_ns for _ in range(2)] == [0, 1]
-    with pytest.raises(RecordingError, match="cut off"):
-        next(frames)
-
-
-def test_one_pixel_makes_another_image() -> None:
-    other, last = _A.copy(), _B.copy()
-    other[31, 47] ^= 1
-    last[0, 0] ^= 1
-    assert _kept(_pairs((_A, _B), (other, last), (_A, _B))) == [True, True, True]
-
-
 def test_faulty_frames_in_between_do_not_hide_a_repeat() -> None:
     first, second, third, fourth = _pairs((_A, _B), (_A, _B), (_A, _B), (_C, _D))
     faulty = FaultyFrame(stamp_ns=9, reason="damaged")
@@ -331,12 +265,3 @@ def test_depth_may_repeat_and_so_may_images_of_one_value() -> None:
     assert _kept(rgbd) == [True, True, False, False]
     black = np.zeros_like(_A)
     assert _kept(_pairs(*[(black, black)] * 4)) == [True] * 4
-
-
-@pytest.mark.parametrize(("index", "name"), [(0, "left"), (1, "right")])
-def test_the_reason_names_the_stream_and_what_to_do(index: int, name: str) -> None:
-    images = [(_A, _B), *[(_A, _D) if index == 0 else (_C, _B)] * 2]
-    *_, frame = refuse_repeats(_pairs(*images), ("left", "right"))
-    assert isinstance(frame, FaultyFrame)
-    assert frame.reason.startswith(f"the {name} image is that of the frame before")
-    assert "--set sync.repeated_images=keep" in frame.reason

@@ -41,11 +41,6 @@ def test_folders_are_recognised_by_what_they_hold(tmp_path: Path, tiny: Any) -> 
             open_recording(tmp_path / name)
 
 
-def test_no_path_at_all_is_a_misuse() -> None:
-    with pytest.raises(ValueError, match="at least one path"):
-        open_recording([])
-
-
 def test_compressed_files_of_ros2_are_bags_with_and_without_metadata(tmp_path: Path) -> None:
     assert not is_bag(tmp_path)
     file = tmp_path / "drive.mcap.zstd"

@@ -1,7 +1,6 @@
 """Pairing by stamp."""
 
 from collections.abc import Iterable, Iterator
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ _LIMIT = 20
 _QUEUE = 100
 _any_stamps = st.lists(st.integers(0, 400), max_size=30)
 _stamps = st.one_of(_any_stamps.map(sorted), _any_stamps)
-_rising_stamps = st.lists(st.integers(0, 300), unique=True, max_size=30).map(sorted)
 _order = st.lists(st.booleans(), max_size=60)
 
 
@@ -57,70 +55,11 @@ def _pair(
     return found
 
 
-def _pairs(first: list[int], second: list[int], age_penalty: float = 0.1) -> list[tuple[int, int]]:
-    answers = _pair(first, second, age_penalty=age_penalty)
-    return [answer for answer in answers if isinstance(answer, tuple)]
-
-
 def _answered(answers: list[tuple[int, int] | str]) -> list[int]:
     return [
         answer[0] if isinstance(answer, tuple) else int(answer.partition(":")[0])
         for answer in answers
     ]
-
-
-@given(first=_stamps, second=_stamps, order=_order)
-def test_the_interleaving_of_the_streams_does_not_matter(
-    first: list[int], second: list[int], order: list[bool]
-) -> None:
-    assert _pair(first, second, order) == _pair(first, second)
-
-
-@given(first=_rising_stamps, second=_rising_stamps, order=_order)
-def test_the_interleaving_does_not_matter_for_equal_stamps_that_increase(
-    first: list[int], second: list[int], order: list[bool]
-) -> None:
-    assert _pair(first, second, order, limit_ns=0) == _pair(first, second, limit_ns=0)
-
-
-@given(first=_rising_stamps, second=_rising_stamps, age_penalty=st.floats(0, 10))
-def test_pairs_keep_the_limit_and_the_order_and_use_each_image_once(
-    first: list[int], second: list[int], age_penalty: float
-) -> None:
-    pairs = _pairs(first, second, age_penalty)
-    assert all(abs(image - partner) <= _LIMIT for image, partner in pairs)
-    for stream in zip(*pairs, strict=True):
-        assert list(stream) == sorted(set(stream))
-
-
-@given(first=_rising_stamps, second=_rising_stamps)
-def test_one_of_a_pair_is_next_to_the_other(first: list[int], second: list[int]) -> None:
-    for pair in _pairs(first, second):
-        between = [[t for t in stream if min(pair) < t < max(pair)] for stream in (first, second)]
-        assert not all(between)
-
-
-@given(first=_rising_stamps, second=_rising_stamps)
-def test_no_two_images_that_make_a_pair_are_left_alone(first: list[int], second: list[int]) -> None:
-    pairs = [(-(10**6), -(10**6)), *_pairs(first, second), (10**6, 10**6)]
-    for before, after in pairwise(pairs):
-        alone = [stamp for stamp in first if before[0] < stamp < after[0]]
-        free = [stamp for stamp in second if before[1] < stamp < after[1]]
-        assert all(abs(image - partner) > _LIMIT for image in alone for partner in free)
-
-
-@given(
-    shift=st.integers(-2, 2),
-    noise=st.lists(st.integers(-2, 2), min_size=30, max_size=30),
-    missing=st.sets(st.integers(0, 29)),
-)
-def test_missing_images_do_not_matter_where_partners_are_nearer_than_all_others(
-    shift: int, noise: list[int], missing: set[int]
-) -> None:
-    truth = [(10 * n, 10 * n + shift + noise[n]) for n in range(30)]
-    pairs = [pair for n, pair in enumerate(truth) if n not in missing]
-    partners = [partner for _, partner in truth]
-    assert _pair([image for image, _ in pairs], partners, limit_ns=4) == pairs
 
 
 @given(first=_stamps, second=_stamps, order=_order, limit_ns=st.sampled_from([0, _LIMIT]))
@@ -140,89 +79,6 @@ def test_the_stamps_of_pairs_increase_whatever_comes(
     answers = _pair(first, second, order, limit_ns=limit_ns)
     stamps = [answer[0] for answer in answers if isinstance(answer, tuple)]
     assert stamps == sorted(set(stamps))
-
-
-@given(first=_rising_stamps, second=_rising_stamps, order=_order)
-def test_all_equal_stamps_pair_without_a_tolerance_and_no_others(
-    first: list[int], second: list[int], order: list[bool]
-) -> None:
-    pairs = [a for a in _pair(first, second, order, limit_ns=0) if isinstance(a, tuple)]
-    assert pairs == [(stamp, stamp) for stamp in sorted(set(first) & set(second))]
-
-
-# What message_filters 1.15.15 gives, with a last image of each stream long after: stamps of both
-# streams, limit, age penalty, places of the paired images within their streams.
-_KNOWN = [
-    ([100, 130], [85, 112], 20, 0.1, [(0, 1)]),
-    ([100, 130], [85, 112, 131], 20, 0.1, [(0, 1), (1, 2)]),
-    ([100, 200], [92, 110, 190, 210], 20, 0.1, [(0, 0), (1, 2)]),
-    ([100, 200], [92, 106, 190, 205], 20, 0.1, [(0, 1), (1, 3)]),
-    (
-        [0, 33, 67, 100, 133, 167, 200],
-        [10, 77, 143, 210],
-        20,
-        0.1,
-        [(0, 0), (2, 1), (4, 2), (6, 3)],
-    ),
-    (
-        [0, 33, 67, 100, 133, 167, 200],
-        [10, 77, 143, 210],
-        20,
-        1.0,
-        [(0, 0), (2, 1), (4, 2), (6, 3)],
-    ),
-    (
-        [0, 33, 66, 99, 132],
-        [16, 50, 82, 116, 148],
-        20,
-        0.1,
-        [(0, 0), (1, 1), (2, 2), (3, 3), (4, 4)],
-    ),
-    ([0, 33, 66, 99, 132], [16, 50, 82, 116, 148], 20, 0.0, [(0, 0), (2, 1), (3, 2), (4, 3)]),
-    ([0, 33, 66, 99, 132], [17, 49, 83, 115, 149], 20, 0.0, [(1, 0), (2, 1), (3, 2), (4, 3)]),
-    ([100, 200, 150, 300], [100, 200, 150, 300], 20, 0.1, [(0, 0), (1, 1), (3, 3)]),
-    ([100, 100, 130], [95, 100, 100, 131], 20, 0.1, [(0, 1), (2, 3)]),
-    ([100, 90, 110, 130], [95, 115, 105, 135], 20, 0.1, [(0, 0), (2, 1), (3, 3)]),
-    ([50, 40, 60], [45, 70], 20, 0.1, [(0, 0), (2, 1)]),
-    ([0, 10, 20, 30, 100], [31, 101], 40, 0.1, [(3, 0), (4, 1)]),
-    ([0, 10, 20, 31, 100], [31, 101], 40, 0.1, [(3, 0), (4, 1)]),
-    ([31, 101], [0, 10, 20, 30, 100], 40, 0.1, [(0, 3), (1, 4)]),
-    ([5, 26], [0, 21, 30], 20, 0.1, [(0, 0), (1, 2)]),
-    ([0, 20, 40, 60, 80], [19, 41, 59, 81], 20, 0.1, [(1, 0), (2, 1), (3, 2), (4, 3)]),
-    ([100, 200], [200, 100], 0, 0.1, [(1, 0)]),
-    ([1, 3, 2, 4], [1, 2, 3, 4], 0, 0.1, [(0, 0), (2, 1), (1, 2), (3, 3)]),
-    ([1, 1, 2], [1, 2, 2], 0, 0.1, [(1, 0), (2, 1)]),
-    # nearer by the penalty exactly, in floating point
-    ([10**8], [89_000_000, 110_000_000], 20_000_000, 0.1, [(0, 0)]),
-    ([100], [88, 110], 20, 0.1, [(0, 1)]),
-    ([100], [88, 110], 20, 0.5, [(0, 0)]),
-]
-
-
-@pytest.mark.parametrize(("first", "second", "limit_ns", "age_penalty", "places"), _KNOWN)
-def test_known_pairs_are_found(
-    first: list[int],
-    second: list[int],
-    limit_ns: int,
-    age_penalty: float,
-    places: list[tuple[int, int]],
-) -> None:
-    answers = _pair(first, second, limit_ns=limit_ns, age_penalty=age_penalty)
-    pairs = [answer for answer in answers if isinstance(answer, tuple)]
-    assert pairs == [(first[n], second[k]) for n, k in places]
-
-
-def test_a_pair_is_given_as_soon_as_the_next_image_shows_that_it_is_the_best() -> None:
-    n_pushed = 0
-
-    def images() -> Iterator[StampedImage]:
-        nonlocal n_pushed
-        for stream, stamp_ns in [(0, 0), (1, 5), (1, 35), (0, 30), (0, 60), (1, 60), (0, 90)]:
-            n_pushed += 1
-            yield _image(stream, stamp_ns)
-
-    given_after = [n_pushed for _ in pair_images(images(), limit_ns=20, partner="depth")]
-    assert given_after == [4, 5, 6, 7]
 
 
 @given(
@@ -314,26 +170,6 @@ def test_a_wrong_stamp_without_partner_does_not_spoil_those_after_it() -> None:
     stamps = [100, 200, 300, 400]
     answers = _pair([100, 10**9, 200, 300, 400], stamps, [False, True] * 5, limit_ns=0)
     assert [answer for answer in answers if isinstance(answer, tuple)] == [(s, s) for s in stamps]
-
-
-@pytest.mark.parametrize("limit_ns", [0, _LIMIT])
-def test_one_stream_may_run_ahead_as_far_as_the_queue_reaches(limit_ns: int) -> None:
-    stamps = list(range(0, 1000 * _QUEUE, 1000))
-    pairs = [(stamp, stamp) for stamp in stamps]
-    assert _pair(stamps, stamps, [False] * _QUEUE, limit_ns=limit_ns) == pairs
-    lost, *found = _pair([-1000, *stamps], stamps, [False] * (_QUEUE + 1), limit_ns=limit_ns)
-    assert str(lost).endswith("there is none, and 100 images wait already")
-    assert found == pairs
-
-
-def test_an_image_that_follows_a_given_up_one_is_no_pivot() -> None:
-    """The partner of depth 95 might have been the image at 96 that had to go."""
-    images = [_image(0, stamp) for stamp in (96, 100, 200)]
-    images += [_image(1, 95), _image(1, 201)]
-    answers = list(pair_images(images, limit_ns=20, partner="depth", queue_size=2))
-    assert isinstance(answers[0], FaultyFrame)
-    assert isinstance(answers[1], FaultyFrame)
-    assert isinstance(answers[2], tuple)
 
 
 @pytest.mark.parametrize("limit_ns", [0, _LIMIT])

@@ -7,13 +7,12 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import yaml
 from scipy.spatial.transform import Rotation
 
 from gvo.errors import CalibrationError
 from gvo.geometry import se3
 from gvo.geometry.camera import rectification_maps
-from gvo.io.bag.calibration import BagCalibration, calibrations_of_file, calibrations_of_messages
+from gvo.io.bag.calibration import BagCalibration, calibrations_of_messages
 from gvo.io.bag.reader import BagReader
 from gvo.io.bag.topics import COMPRESSED_TYPE, IMAGE_TYPE, TopicChoice, choose_topics
 from gvo.io.calibration.camera_info import stereo_baseline
@@ -109,15 +108,6 @@ def test_rectified_images_without_baseline_take_it_fromtf(tmp_path: Path) -> Non
         _found(tmp_path / "b.bag", messages)
 
 
-def test_a_baseline_of_p_wins_overtf(tmp_path: Path) -> None:
-    messages = [*_pair(P=_P), *_mounts()]
-    info = camera_info("/s/right/camera_info", "right_optical", P=[*_P[:3], -25.0, *_P[4:]])
-    messages[3] = info
-    found = _found(tmp_path / "a.bag", messages)
-    assert "baseline: 0.5000 m from P of /s/right/camera_info" in found.decisions
-    np.testing.assert_array_equal(found.calibrations[1].P, np.reshape(info[3].P, (3, 4)))  # type: ignore[attr-defined]
-
-
 def test_without_any_baseline_the_message_says_what_was_looked_for(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match=r"nor from tf: .*right_optical.*--calibration FILE"):
         _found(tmp_path / "a.bag", [*_pair(), _mounts()[0]])
@@ -174,13 +164,6 @@ def test_depth_of_another_camera_comes_with_its_calibration_and_place(tmp_path: 
     assert "0.0152 m from colour by tf color_optical -> depth_optical" in line
 
 
-def test_the_place_alone_makes_a_camera_of_its_own(tmp_path: Path) -> None:
-    mount = tf("/tf_static", "color_optical", "depth_optical", _T_COLOR_DEPTH)
-    view = _found(tmp_path / "a.bag", [*_rgbd(), mount]).depth_view
-    assert view is not None
-    np.testing.assert_allclose(view.T_color_depth, _T_COLOR_DEPTH, atol=1e-9)
-
-
 def test_depth_of_one_frame_and_other_intrinsics_needs_notf(tmp_path: Path) -> None:
     depths: list[dict[str, Any]] = [{"K": _DEPTH_K}, {"width": 64}]
     for n, changes in enumerate(depths):
@@ -219,35 +202,6 @@ def test_without_tf_the_advice_is_one_line(tmp_path: Path) -> None:
     assert "taken as registered" in line
     found = _found(tmp_path / "c.bag", _rgbd("/c/unregistered_depth/image_raw", K=_DEPTH_K))
     assert "not registered to colour" in found.decisions[-1]
-
-
-def test_a_depth_camera_without_calibration_is_taken_as_registered(tmp_path: Path) -> None:
-    found = _found(tmp_path / "a.bag", _rgbd(K=np.zeros(9)))
-    assert found.depth_view is None
-    assert "/c/depth/camera_info: the camera is not calibrated" in found.decisions[-1]
-
-
-def test_a_file_wins_and_names_body_and_frame(tmp_path: Path, tiny: Any) -> None:
-    reader = BagReader(write(tmp_path / "a.bag", [m for m in _pair() if m[1] == IMAGE_TYPE]))
-    topics = choose_topics(reader.topics, TopicChoice(), "")
-    camera = {
-        "intrinsics": [50.0, 50.0, 23.5, 15.5],
-        "resolution": [48, 32],
-        "distortion_coefficients": _D[:4],
-    }
-    for n, T in enumerate([_T_BODY_LEFT, _T_BODY_LEFT @ _T_LEFT_RIGHT]):
-        content = camera | {"T_BS": {"data": T.ravel().tolist()}}
-        (tmp_path / f"{n}.yaml").write_text(yaml.safe_dump(content))
-    found = calibrations_of_file([tmp_path / "0.yaml", tmp_path / "1.yaml"], topics, reader)
-    assert found.frame_id == "camera"
-    assert found.T_body_cam is not None
-    R = found.calibrations[0].R
-    np.testing.assert_allclose(found.T_body_cam[:3, :3], _T_BODY_LEFT[:3, :3] @ R.T, atol=1e-12)
-    assert any(line.startswith("baseline: 0.1200 m from the poses") for line in found.decisions)
-    ros = tmp_path / "c.yaml"
-    ros.write_text(yaml.safe_dump(tiny.ros_camera()))
-    with pytest.raises(CalibrationError, match="left and right"):
-        calibrations_of_file(ros, topics)
 
 
 @pytest.mark.recorded

@@ -129,13 +129,3 @@ def test_the_walk_over_the_records_finds_what_the_index_does(gvo_data: Path, nam
 
 def _scan(path: Path) -> Scan:
     return Ros1Scan(path) if path.suffix == ".bag" else McapScan(path)
-
-
-def test_old_types_and_names_of_types_are_decoded(gvo_data: Path) -> None:
-    message = next(BagReader(gvo_data / "bags/good/tf_lz4.bag").messages(["/tf"]))
-    assert message.topic.type == "tf/msg/tfMessage"
-    (transform,) = message.decode().transforms
-    assert transform.child_frame_id.startswith("turtle")
-    reader = BagReader(gvo_data / "bags/bad/old_type_names.db3")
-    image = next(reader.messages(["/image"])).decode()
-    assert len(image.data) == image.step * image.height > 0

@@ -96,13 +96,6 @@ def test_two_cameras_are_refused_with_what_to_type() -> None:
     assert _choose(topics, right="a/right/image")[1] == "/a/left/image"
 
 
-def test_a_stereo_and_an_rgbd_camera_are_refused_until_one_is_named() -> None:
-    topics = _topics("/left/image", "/right/image", "/color/image", "/depth/image")
-    with pytest.raises(RecordingError, match=r"--left /left/image .* or --color /color/image"):
-        _choose(topics)
-    assert _choose(topics, depth="/depth/image")[0] == "rgbd"
-
-
 def test_any_two_topics_can_be_named() -> None:
     topics = _topics("/a", "/b")
     assert _choose(topics, left="/b", right="/a") == ("stereo", "/b", "/a")
@@ -133,12 +126,6 @@ def test_one_camera_is_too_few_whatever_is_chosen(names: list[str]) -> None:
     with pytest.raises(RecordingError, match=r"one camera alone.*needs a stereo pair") as caught:
         _choose(_topics(*names))
     assert "--left" not in str(caught.value)
-
-
-def test_topics_without_messages_are_no_camera() -> None:
-    topics = _topics("/left/image", "/right/image", n_messages=0)
-    with pytest.raises(RecordingError, match="gvo needs a stereo pair"):
-        _choose(topics)
 
 
 @pytest.mark.parametrize(

@@ -34,25 +34,12 @@ def _fields(**changes: Any) -> CameraFields:
     return CameraFields(**(values | changes))
 
 
-def test_all_numbers_are_taken_over_bit_by_bit() -> None:
-    calibration = make_calibration(_fields(), is_rectified=False)
-    np.testing.assert_array_equal(calibration.K.ravel(), _K)
-    np.testing.assert_array_equal(calibration.D, [0.1, -0.2, 0.001, 0.002, 0.05])
-    np.testing.assert_array_equal(calibration.P.ravel(), _P)
-
-
 def test_what_is_not_set_is_made_up_from_the_other_matrix() -> None:
     calibration = make_calibration(_fields(R=np.zeros(9), P=np.zeros(12)), is_rectified=False)
     np.testing.assert_array_equal(calibration.R, np.eye(3))
     np.testing.assert_array_equal(calibration.P[:, :3], calibration.K)
     rectified = make_calibration(_fields(K=np.zeros(9)), is_rectified=True)
     np.testing.assert_array_equal(rectified.K, rectified.P[:, :3])
-
-
-@pytest.mark.parametrize("D", [[], [0.1, 0.2, 0.3, 0.4]])
-def test_missing_distortion_coefficients_are_zero(D: list[float]) -> None:
-    calibration = make_calibration(_fields(D=D), is_rectified=False)
-    np.testing.assert_array_equal(calibration.D, [*D, 0, 0, 0, 0, 0][:5])
 
 
 @pytest.mark.parametrize(
@@ -98,13 +85,6 @@ def test_depth_is_not_rectified_by_a_camera_that_turns() -> None:
         np.testing.assert_array_equal(calibration.R, np.eye(3))
 
 
-def test_the_model_of_rectified_images_or_without_distortion_does_not_matter() -> None:
-    fields = _fields(model="rational_polynomial", D=[0.1] * 8)
-    assert not np.any(make_calibration(fields, is_rectified=True).D)
-    fields = _fields(model="Brown Conrady", D=np.zeros(5))
-    assert not np.any(make_calibration(fields, is_rectified=False).D)
-
-
 @pytest.mark.parametrize(
     ("name", "n", "model", "n_kept"),
     [
@@ -129,36 +109,11 @@ def test_the_model_goes_by_name_and_count(name: str, n: int, model: str, n_kept:
     np.testing.assert_array_equal(calibration.D, [*D, *[0.0] * (n_kept - n)])
 
 
-def test_zeros_after_the_coefficients_of_a_fisheye_are_filling() -> None:
-    fields = _fields(model="Kannala Brandt4", D=[0.1, 0.2, 0.3, 0.4, 0.0])
-    np.testing.assert_array_equal(
-        make_calibration(fields, is_rectified=False).D, [0.1, 0.2, 0.3, 0.4]
-    )
-
-
 def test_zeros_of_a_fisheye_mean_no_distortion_unless_they_are_meant() -> None:
     unset = make_calibration(_fields(model="equidistant", D=[0.0] * 4), is_rectified=False)
     assert unset.model == "plumb_bob"
     fields = _fields(model="equidistant", D=[0.0] * 4, is_distorted_by_zeros=True)
     assert make_calibration(fields, is_rectified=False).model == "equidistant"
-
-
-def test_binning_and_region_give_the_camera_of_the_recorded_image() -> None:
-    # by hand, as image_geometry has it: the region first, then both axes by their binning
-    fields = _fields(
-        width=1280,
-        height=960,
-        K=[800.0, 0, 640, 0, 810, 480, 0, 0, 1],
-        P=[700.0, 0, 630, -70, 0, 700, 470, 0, 0, 0, 1, 0],
-        binning=(2, 4),
-        roi=RegionOfInterest(x_offset=100, y_offset=60, width=800, height=600),
-    )
-    calibration = make_calibration(fields, is_rectified=False)
-    assert (calibration.width, calibration.height) == (400, 150)
-    np.testing.assert_allclose(calibration.K.ravel(), [400, 0, 270, 0, 202.5, 105, 0, 0, 1])
-    expected = [350, 0, 265, -35, 0, 175, 102.5, 0, 0, 0, 1, 0]
-    np.testing.assert_allclose(calibration.P.ravel(), expected)
-    np.testing.assert_array_equal(calibration.D, fields.D)
 
 
 @given(
@@ -186,13 +141,6 @@ def test_a_binned_region_sees_a_point_where_the_full_image_has_it(
         atol=1e-9,
     )
     assert (part.width, part.height) == (1000 // scale, 800 // scale)
-
-
-def test_a_region_of_size_zero_is_the_rest_of_the_image() -> None:
-    assert make_calibration(_fields(), is_rectified=False).width == 48
-    rest = _fields(roi=RegionOfInterest(x_offset=8, y_offset=2))
-    calibration = make_calibration(rest, is_rectified=False)
-    assert (calibration.width, calibration.height) == (40, 30)
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,7 @@
 """Messages written into bags, compressed ones too."""
 
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,42 +9,11 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from gvo.errors import RecordingError
-from gvo.geometry.camera import Calibration, PinholeCamera
-from gvo.io.convert.bag_messages import (
-    BagWriter,
-    Header,
-    write_camera_info,
-)
 from gvo.io.convert.convert import convert
-from gvo.io.images import encode_image
 from gvo.io.opening import open_recording
 from tests.io.conftest import Item, Tiny
 
 _NAMES = pytest.mark.parametrize("name", ["a.bag", "a.mcap"])
-_CAMERA = PinholeCamera(fx=50.1, fy=50.3, cx=23.7, cy=15.9, width=48, height=32)
-
-
-@_NAMES
-@pytest.mark.parametrize(
-    ("model", "n_coefficients"),
-    [("plumb_bob", 5), ("rational_polynomial", 8), ("rational_polynomial", 14), ("equidistant", 4)],
-)
-def test_camera_info_names_the_distortion_model_and_holds_all_its_coefficients(
-    tmp_path: Path,
-    name: str,
-    model: Literal["plumb_bob", "rational_polynomial", "equidistant"],
-    n_coefficients: int,
-) -> None:
-    D = np.linspace(-0.01, 0.02, n_coefficients)
-    ideal = Calibration.from_camera(_CAMERA)
-    with BagWriter(tmp_path / name) as bag:
-        calibration = replace(ideal, D=D, model=model, is_rectified=False)
-        write_camera_info(bag, "/camera_info", calibration, Header(5, "camera"))
-    with AnyReader([bag.result]) as reader:
-        ((connection, _, data),) = reader.messages()
-        message: Any = reader.deserialize(data, connection.msgtype)
-    assert message.distortion_model == model
-    np.testing.assert_array_equal(message.d if name == "a.mcap" else message.D, D)
 
 
 def _messages(path: Path, topic: str) -> list[Any]:
@@ -107,8 +75,3 @@ def test_depth_not_of_millimetres_stays_as_it_is(tiny: Tiny, tmp_path: Path, nam
     convert(tiny.rgbd([*items, (1, 2, tiny.depth(0))]), tmp_path / name, compress=True)
     (message,) = _messages(tmp_path / name, "/camera/depth/image")
     assert message.encoding == "32FC1"
-
-
-def test_what_png_cannot_hold_is_refused() -> None:
-    with pytest.raises((RecordingError, cv2.error)):
-        encode_image(np.zeros((0, 3), np.uint8), ".png")

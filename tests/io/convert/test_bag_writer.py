@@ -191,21 +191,6 @@ def test_an_image_that_cannot_be_read_is_left_out_and_named(tmp_path: Path) -> N
     )
 
 
-def test_progress_is_told(tmp_path: Path) -> None:
-    told: list[int] = []
-    convert(_stereo(n=2), tmp_path / "a.bag", progress=told.append)
-    assert told == [1, 2, 3, 4]
-
-
-@_GENERATIONS
-def test_nothing_is_overwritten(tmp_path: Path, name: str) -> None:
-    convert(_stereo(), tmp_path / name)
-    before = _fingerprints(open_recording(tmp_path / name))
-    with pytest.raises(RecordingError, match=f"{name}: exists already"):
-        convert(_stereo(n=1), tmp_path / name)
-    assert _fingerprints(open_recording(tmp_path / name)) == before
-
-
 @_GENERATIONS
 def test_nothing_is_left_behind_where_writing_fails(tmp_path: Path, name: str) -> None:
     items: list[Item] = [(0, 5, _noise(1)), (1, 5, _noise(2)), (0, -1, _noise(3))]
@@ -213,18 +198,6 @@ def test_nothing_is_left_behind_where_writing_fails(tmp_path: Path, name: str) -
     with pytest.raises(RecordingError, match="the stamp -1 ns cannot be written"):
         convert(source, tmp_path / name)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_folder_that_may_not_be_written_is_told_in_words(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def forbid(*_: object, **__: object) -> None:
-        raise PermissionError(13, "Permission denied", f"{tmp_path}/.convert-x")
-
-    monkeypatch.setattr("tempfile.TemporaryDirectory", forbid)
-    path = tmp_path / "a.bag"
-    with pytest.raises(RecordingError, match=f"^{path}: cannot be written: Permission denied$"):
-        convert(_stereo(), path)
 
 
 def test_other_suffixes_and_missing_folders_are_refused(tmp_path: Path) -> None:

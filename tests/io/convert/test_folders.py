@@ -20,7 +20,7 @@ from gvo.geometry.se3 import make_transform
 from gvo.io.bag.source import BagSource
 from gvo.io.convert.convert import Conversion, Layout, convert
 from gvo.io.frames import frames
-from gvo.io.opening import RecordingOptions, open_recording
+from gvo.io.opening import open_recording
 from gvo.io.recording import DepthView, Source, StampedImage
 from gvo.trajectory.formats import read_trajectory, write_euroc, write_tum
 from gvo.trajectory.trajectory import Trajectory
@@ -288,20 +288,6 @@ def test_depth_of_another_camera_is_registered_on_writing(
     assert colors == ([2, 2] if is_raw else [3, 3])
 
 
-def test_depth_of_a_camera_with_other_raw_intrinsics_stays(tiny: Tiny, tmp_path: Path) -> None:
-    # As drivers do: CameraInfo of image_rect_color keeps K of the raw camera.
-    K = tiny.camera.K + np.array([[9.0, 0, 3.0], [0, 9.0, -2.0], [0, 0, 0]])
-    calibration = replace(Calibration.from_camera(tiny.camera), K=K)
-    source = tiny.rgbd(_rgbd_items(tiny), calibrations=(calibration,))
-    for name in ("a.bag", "tum"):
-        write: Any = write_folder if name == "tum" else convert
-        write(source, tmp_path / name)
-        copy = open_recording(tmp_path / name)
-        assert copy.info.depth_view is None
-        mine, theirs = (list(map(tiny.fingerprint, frames(s, Config()))) for s in (copy, source))
-        assert mine == theirs
-
-
 _LAYOUTS: Sequence[Layout] = ("kitti", "euroc", "tum")
 
 
@@ -420,23 +406,3 @@ def test_a_tum_folder_may_have_the_name_of_its_own_camera(tiny: Tiny, tmp_path: 
     np.testing.assert_array_equal(copy.info.calibrations[0].K, camera[0].K)
     *_, last = (image.load() for image in copy.images())
     np.testing.assert_array_equal(last, depth)
-
-
-def test_layouts_that_do_not_fit_the_sensor_are_refused(tiny: Tiny, tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="rgbd recording cannot have the layout kitti"):
-        write_folder(tiny.rgbd(_rgbd_items(tiny)), tmp_path / "a", layout="kitti")
-    with pytest.raises(RecordingError, match=r"stereo recording cannot .* expected kitti or euroc"):
-        write_folder(tiny.stereo(_pairs(tiny)), tmp_path / "a", layout="tum")
-
-
-def test_body_and_calibration_of_a_file_are_written(tiny: Tiny, tmp_path: Path) -> None:
-    origin = _write_euroc(tiny, tmp_path / "origin", "radial-tangential")
-    convert(open_recording(origin), tmp_path / "a.bag")
-    options = RecordingOptions(calibration=[origin])
-    write_folder(open_recording(tmp_path / "a.bag", options=options), tmp_path / "copy")
-    np.testing.assert_allclose(
-        _T_body_cam(open_recording(tmp_path / "copy")),
-        _T_body_cam(open_recording(origin)),
-        rtol=0,
-        atol=1e-12,
-    )

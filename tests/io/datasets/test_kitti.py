@@ -24,14 +24,6 @@ def test_images_come_by_stamp_and_unchanged(tmp_path: Path, tiny: Any) -> None:
     assert source.info.name == "00"
 
 
-def test_the_camera_is_that_of_the_projections(tmp_path: Path, tiny: Any) -> None:
-    info = KittiSource(tiny.write_kitti(tmp_path / "00")).info
-    camera = info.camera
-    assert getattr(camera, "baseline", None) == 0.5
-    assert (camera.width, camera.height, camera.fx) == (*tiny.size, 50.0)
-    assert all(calibration.is_rectified for calibration in info.calibrations)
-
-
 def test_colour_cameras_are_read_where_grey_ones_are_missing(tmp_path: Path, tiny: Any) -> None:
     source = KittiSource(tiny.write_kitti(tmp_path / "00", cameras=(2, 3)))
     np.testing.assert_array_equal(next(source.images()).load(), tiny.texture(2, is_color=True))
@@ -121,15 +113,6 @@ def test_a_malformed_folder_is_refused(
     assert "\n" not in str(caught.value)
 
 
-def test_exchanged_cameras_are_refused(tmp_path: Path, tiny: Any) -> None:
-    folder = tiny.write_kitti(tmp_path / "00")
-    text = (folder / "calib.txt").read_text()
-    text = text.replace("P0", "PX").replace("P1", "P0").replace("PX", "P1")
-    (folder / "calib.txt").write_text(text)
-    with pytest.raises(CalibrationError, match=r"calib\.txt: the baseline must be positive"):
-        KittiSource(folder)
-
-
 def test_the_first_image_that_can_be_read_says_the_size(tmp_path: Path, tiny: Any) -> None:
     folder = tiny.write_kitti(tmp_path / "00")
     (folder / "image_0" / "000000.png").write_bytes(b"damaged")
@@ -138,15 +121,3 @@ def test_the_first_image_that_can_be_read_says_the_size(tmp_path: Path, tiny: An
         path.write_bytes(b"damaged")
     with pytest.raises(RecordingError, match="none of its 3 images can be read"):
         KittiSource(folder)
-
-
-@pytest.mark.recorded
-def test_the_recorded_drive_is_read(gvo_data: Path) -> None:
-    source = KittiSource(gvo_data / "kitti_06_start")
-    assert source.info.n_images == 51
-    assert getattr(source.info.camera, "baseline", 0.0) == pytest.approx(0.53715, abs=1e-5)
-    truth = source.ground_truth()
-    assert truth is not None
-    assert len(truth) == 51
-    assert truth.stamps_ns[1] == 104_498_900
-    assert np.linalg.norm(truth.positions[-1]) == pytest.approx(60, abs=3)

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from gvo.config import Config, DepthConfig
-from gvo.errors import CalibrationError, RecordingError
+from gvo.errors import CalibrationError
 from gvo.io.datasets.tum import TumSource
 from gvo.io.frames import frames
 from gvo.types import RgbdFrame
@@ -71,12 +71,6 @@ def test_the_file_given_wins_then_the_name_then_the_file_beside(tmp_path: Path, 
     assert "calibration: mine.yaml" in info.decisions
 
 
-@pytest.mark.parametrize("name", ["afr1ca", "fr10", "fr1day", "freiburg4_desk", "fr"])
-def test_a_name_that_only_looks_alike_tells_no_camera(tmp_path: Path, tiny: Any, name: str) -> None:
-    folder = tiny.write_tum(tmp_path / name, _COLOR, _DEPTH)
-    assert TumSource(folder).info.camera.fx == tiny.camera.fx
-
-
 def test_without_any_calibration_the_message_says_what_to_give(tmp_path: Path, tiny: Any) -> None:
     folder = tiny.write_tum(tmp_path / "office", _COLOR, _DEPTH)
     (folder / "calibration.yaml").unlink()
@@ -94,27 +88,6 @@ def test_the_scale_is_the_users_then_the_files_then_5000(tmp_path: Path, tiny: A
     (folder / "calibration.yaml").write_text(yaml.safe_dump(tiny.ros_camera(depth_scale=2500)))
     assert largest() == pytest.approx(2 * at_5000)
     assert largest(config=Config(depth=DepthConfig(scale=10000.0))) == pytest.approx(0.5 * at_5000)
-
-
-def test_a_camera_on_a_body_says_where(tmp_path: Path, tiny: Any) -> None:
-    folder = tiny.write_tum(tmp_path / "f", _COLOR, _DEPTH)
-    T_cam_imu = np.eye(4)
-    T_cam_imu[:3, 3] = 0.1, 0.2, 0.3
-    camera = {
-        "camera_model": "pinhole",
-        "intrinsics": [50.0, 50.0, 23.5, 15.5],
-        "resolution": [48, 32],
-        "distortion_model": "equidistant",
-        "distortion_coeffs": [0.1, 0.0, 0.0, 0.0],
-        "T_cam_imu": T_cam_imu.tolist(),
-    }
-    path = tmp_path / "camchain-imucam.yaml"
-    path.write_text(yaml.safe_dump({"cam0": camera}))
-    info = TumSource(folder, calibration=path).info
-    assert info.calibrations[0].model == "equidistant"
-    assert info.T_body_cam is not None
-    np.testing.assert_allclose(info.T_body_cam[:3, 3], [-0.1, -0.2, -0.3])
-    assert "calibration: camchain-imucam.yaml" in info.decisions
 
 
 def _depth_decision(source: TumSource) -> str:
@@ -136,20 +109,6 @@ def test_depth_that_only_makes_sense_in_millimetres_is_read_so(tmp_path: Path, t
     np.testing.assert_allclose(found[is_known], expected[is_known], atol=2e-3)
     insisted = TumSource(folder, config=Config(depth=DepthConfig(scale=5000.0)))
     assert _depth_decision(insisted) == "depth: 5000 counts per metre, by depth.scale"
-
-
-def test_a_published_camera_keeps_its_scale_for_near_scenes(tmp_path: Path, tiny: Any) -> None:
-    folder = tiny.write_tum(tmp_path / "fr2_near", _COLOR, _DEPTH)
-    for stamp in _DEPTH:
-        tiny.write_image(folder / "depth" / f"{stamp}.png", tiny.counts(0) // 5)
-    assert _depth_decision(TumSource(folder)).startswith("depth: 5000 counts per metre")
-
-
-def test_depth_that_makes_no_sense_at_all_is_doubted(tmp_path: Path, tiny: Any) -> None:
-    folder = tiny.write_tum(tmp_path / "f", _COLOR, _DEPTH)
-    for stamp in _DEPTH:
-        tiny.write_image(folder / "depth" / f"{stamp}.png", tiny.counts(0) // 1000 + 1)
-    assert "implausible" in _depth_decision(TumSource(folder))
 
 
 def test_depth_and_colour_are_undistorted_with_the_same_camera(tmp_path: Path, tiny: Any) -> None:
@@ -179,26 +138,3 @@ def test_the_truth_is_read_where_there_is_one(tmp_path: Path, tiny: Any) -> None
     truth = TumSource(folder).ground_truth()
     assert truth is not None
     np.testing.assert_array_equal(truth.positions, [[1, 2, 3]])
-
-
-@pytest.mark.parametrize("name", ["rgb.txt", "depth.txt"])
-def test_a_missing_list_is_refused(tmp_path: Path, tiny: Any, name: str) -> None:
-    folder = tiny.write_tum(tmp_path / "f", _COLOR, _DEPTH)
-    (folder / name).unlink()
-    with pytest.raises(RecordingError, match=name):
-        TumSource(folder)
-
-
-@pytest.mark.recorded
-def test_nearly_all_recorded_images_find_their_depth(gvo_data: Path) -> None:
-    items = list(frames(TumSource(gvo_data / "rgbd_dataset_freiburg1_xyz_start"), Config()))
-    assert len(items) == 80
-    assert sum(isinstance(item, RgbdFrame) for item in items) >= 78
-
-
-@pytest.mark.recorded
-def test_the_recorded_depth_in_millimetres_is_noticed(gvo_data: Path) -> None:
-    room = TumSource(gvo_data / "sevenscenes_start")
-    assert _depth_decision(room).startswith("depth: 1000 counts per metre, because")
-    desk = TumSource(gvo_data / "rgbd_dataset_freiburg1_xyz_start")
-    assert _depth_decision(desk).startswith("depth: 5000 counts per metre")

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gvo.errors import RecordingError, TrajectoryError
+from gvo.errors import TrajectoryError
 from gvo.geometry import se3
 from gvo.io.edges.events import EdgeEvent, Event, PoseEvent
 from gvo.io.edges.pose_graph import GRAPH, PoseGraphSource, write_graph
@@ -51,12 +51,6 @@ def test_poses_come_with_the_edges_of_the_lines_that_follow_at_once(tmp_path: Pa
         ("edge", 0, 1),
         ("pose", 4, 3),
     ]
-
-
-def test_stamps_are_the_order_a_second_each(tmp_path: Path) -> None:
-    poses = events_of(write(tmp_path, edge_line(7, 4), edge_line(4, 9)))
-    stamps = [event.stamp_ns for event in poses if isinstance(event, PoseEvent)]
-    assert stamps == [0, 1_000_000_000, 2_000_000_000]
 
 
 def test_an_edge_from_a_new_pose_is_turned_round(tmp_path: Path) -> None:
@@ -211,12 +205,6 @@ def test_what_is_no_graph_is_refused(tmp_path: Path, lines: list[str], words: st
     assert "\n" not in str(caught.value)
 
 
-def test_vertices_are_kept(tmp_path: Path) -> None:
-    lines = [format_vertex(n, translation(10.0 + n)) for n in (0, 1)]
-    source = PoseGraphSource(write(tmp_path, *lines, edge_line(0, 1)))
-    assert {n: T[0, 3] for n, T in source.vertices.items()} == {0: 10.0, 1: 11.0}
-
-
 def test_a_malformed_line_further_on_ends_the_stream_with_its_number(tmp_path: Path) -> None:
     source = PoseGraphSource(write(tmp_path, edge_line(0, 1), edge_line(1, 2), "EDGE3 1 2"))
     events = source.events()
@@ -234,9 +222,3 @@ def test_vertices_come_by_their_stamps_then_the_measurements(tmp_path: Path) -> 
     ]
     assert lines[3:] == ["EDGE_SE3:QUAT 5 6", "EDGE_SE3:QUAT 6 7"]
     assert [path.name for path in tmp_path.iterdir()] == [GRAPH]
-
-
-def test_a_file_that_cannot_be_written_is_told(tmp_path: Path) -> None:
-    (tmp_path / GRAPH).mkdir()
-    with pytest.raises(RecordingError, match=f"{GRAPH}: cannot be written"):
-        write_graph(tmp_path, [], [])

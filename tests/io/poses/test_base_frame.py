@@ -20,8 +20,6 @@ from tests.make.results import estimate_at
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
 STAMPS_NS = [1_700_000_000_000_000_000 + n * 100_000_000 for n in range(6)]
-# x forward, y left, z up, of a camera that looks forward
-R_BODY_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def random_transform(rng: np.random.Generator) -> FloatArray:
@@ -86,18 +84,6 @@ def test_a_static_mount_is_composed_as_by_hand(seed: int) -> None:
         np.testing.assert_allclose(out.T_world_frame, T_initial @ T_first_now, rtol=0, atol=1e-9)
         assert (out.stamp_ns, out.status) == (given_.stamp_ns, given_.status)
     assert frame.n_guessed == 0
-
-
-def test_a_camera_that_looks_forward_moves_the_base_along_its_x_axis() -> None:
-    rng = np.random.default_rng(0)
-    T_base_cam = se3.make_transform(R_BODY_OPTICAL, np.array([0.3, 0.0, 1.2]))
-    frame = BaseFrame("base_link", T_base_cam)
-    first, second = camera_drive(rng)[:2]
-    forward = se3.make_transform(np.eye(3), np.array([0.0, 0.0, 2.0]))
-    frame.apply(first)
-    moved = frame.apply(estimate_at(second.stamp_ns, forward))
-    np.testing.assert_allclose(moved.T_world_frame[:3, 3], [2.0, 0.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(moved.T_world_frame[:3, :3], np.eye(3), atol=1e-12)
 
 
 @given(seed=seeds)
@@ -170,18 +156,6 @@ def test_where_tf_starts_late_and_ends_early_the_nearest_transform_is_taken_and_
     assert frame.n_guessed == 3
 
 
-def test_while_the_camera_is_off_its_mount_the_transform_nearest_in_time_is_taken() -> None:
-    buffer = TfBuffer()
-    for stamp_ns in (10, 20, 60, 70):
-        at = np.array([float(stamp_ns), 0.0, 0.0])
-        add_transform(buffer, "base", "cam", stamp_ns, se3.make_transform(np.eye(3), at))
-    add_transform(buffer, "shelf", "cam", 30, np.eye(4))
-    frame = on_tf(buffer, "base", "cam")
-    xs = [float(frame.T_base_cam(stamp_ns)[0, 3]) for stamp_ns in (15, 25, 32, 50, 65)]
-    np.testing.assert_allclose(xs, [15.0, 20.0, 20.0, 60.0, 65.0])
-    assert frame.n_guessed == 2
-
-
 def test_the_first_frame_may_be_named_and_its_pose_given_late() -> None:
     rng = np.random.default_rng(2)
     drive, T_truth = camera_drive(rng), random_transform(rng)
@@ -219,19 +193,6 @@ def test_frames_that_tf_does_not_connect_are_refused_in_one_line(
     assert "\n" not in text
     for word in ("drive.bag", f"--frame {frame}", "--calibration", camera, *words):
         assert word in text
-
-
-def test_without_any_tf_the_line_says_so() -> None:
-    with pytest.raises(RecordingError, match="tf holds no frame base: it is empty"):
-        on_tf(TfBuffer(), "base", "cam")
-
-
-def test_what_is_no_rigid_transform_is_refused() -> None:
-    for T in (np.eye(3), np.diag([1.0, 1.0, -1.0, 1.0]), np.full((4, 4), np.nan), 2 * np.eye(4)):
-        with pytest.raises(ValueError, match="T_base_cam"):
-            BaseFrame("body", T)
-        with pytest.raises(ValueError, match="T_initial"):
-            BaseFrame(T_initial=T)
 
 
 @pytest.mark.parametrize("is_moving", [False, True])

@@ -65,21 +65,6 @@ def test_of_two_poses_of_one_stamp_the_later_counts_and_bad_ones_are_told(tmp_pa
     assert "1 poses; 1 messages hold no pose and were skipped; the first: /truth" in truth.decision
 
 
-def test_fixes_are_positions_without_rotations(tmp_path: Path) -> None:
-    bag = PoseBag(tmp_path / "a.mcap")
-    for n in range(3):
-        bag.fix(n * SECOND, [48.0, 11.0, 500.0 + n])
-    bag.fix(9 * SECOND, [48.0, 11.0, 500.0], status=-1)
-    truth = read(bag.write(), "/fix")
-    assert not truth.trajectory.has_rotations
-    np.testing.assert_allclose(truth.trajectory.positions[:, 2], [0.0, 1.0, 2.0], atol=1e-6)
-    assert truth.child_frame == "gps"
-    assert truth.decision.startswith(
-        "/fix (sensor_msgs/msg/NavSatFix), 3 positions without rotations of gps; east, north, up "
-        "of 48.0000000 deg, 11.0000000 deg, 500.00 m; 1 messages hold no position"
-    )
-
-
 def chain_bag(path: Path) -> PoseBag:
     """Write map -> odom each second, odom -> base each 0.4 s, base -> camera once."""
     bag = PoseBag(path)
@@ -128,13 +113,6 @@ def test_a_chain_needs_its_poses(tmp_path: Path, parent: str, child: str, reason
         read(path, TfTruth(parent=parent, child=child))
 
 
-def test_a_topic_that_is_not_there_is_refused_with_those_that_are(tmp_path: Path) -> None:
-    bag = chain_bag(tmp_path / "a.bag")
-    bag.fix(0, [0, 0, 0])
-    with pytest.raises(RecordingError, match=r"a.bag: has no poses on topic /odom.*/fix \("):
-        read(bag.write(), "/odom")
-
-
 def test_truth_of_converted_data_sets_is_of_the_camera_at_stamps_of_files(tmp_path: Path) -> None:
     bag = PoseBag(tmp_path / "a.bag")
     bag.tf(5, "/world", "/ground_truth", pose(1))
@@ -146,18 +124,6 @@ def test_truth_of_converted_data_sets_is_of_the_camera_at_stamps_of_files(tmp_pa
     assert truth.trajectory.stamps_from == "file"
     assert truth.trajectory.stamps_ns.tolist() == [5, 7]
     np.testing.assert_allclose(truth.trajectory.T_world_frame, [pose(1), pose(2)], atol=1e-12)
-
-
-@pytest.mark.recorded
-def test_the_recorded_chain_of_odometry_is_the_recorded_topic(gvo_data: Path) -> None:
-    path = gvo_data / "bags/good/nav2_turtlebot.mcap"
-    chain = read(path, TfTruth(parent="odom", child="base_link"))
-    topic = read(path, "/odom")
-    assert topic.child_frame == "base_link"
-    np.testing.assert_array_equal(chain.trajectory.stamps_ns, topic.trajectory.stamps_ns)
-    assert len(chain.trajectory) == 2639
-    difference = np.abs(chain.trajectory.T_world_frame - topic.trajectory.T_world_frame).max()
-    assert difference < 1e-9
 
 
 POSE = np.eye(4)
@@ -195,14 +161,6 @@ def test_the_only_topic_of_such_a_name_is_taken_beside_odometry(tmp_path: Path, 
     assert truth.decision.startswith(f"/mocap/robot ({type_}), 1 poses")
 
 
-def test_measured_points_are_taken_as_well(tmp_path: Path) -> None:
-    bag = PoseBag(tmp_path / "a.bag")
-    bag.point("/leica/position", 1, (1.0, 2.0, 3.0), frame="leica")
-    truth = find(bag.write())
-    assert isinstance(truth, Poses)
-    assert not truth.trajectory.has_rotations
-
-
 def test_of_several_none_is_taken_and_all_are_listed(tmp_path: Path) -> None:
     bag = PoseBag(tmp_path / "a.mcap")
     for name in ("/vicon/drone", "/vicon/wand"):
@@ -234,13 +192,6 @@ def test_the_frame_of_converted_data_sets_comes_first(tmp_path: Path) -> None:
     assert isinstance(truth, Poses)
     assert truth.is_of_camera
     assert truth.trajectory.stamps_ns.tolist() == [5]
-
-
-@pytest.mark.recorded
-def test_the_truth_of_a_recorded_bag_of_poses_is_found(gvo_data: Path) -> None:
-    truth = find(gvo_data / "bags/good/pose_streams.bag")
-    assert isinstance(truth, Poses)
-    assert truth.decision == "groundtruth (geometry_msgs/msg/PoseStamped), 12765 poses"
 
 
 names = st.text("abcxyz_019", min_size=1, max_size=8)

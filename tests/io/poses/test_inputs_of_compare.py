@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gvo.errors import GvoError, RecordingError, TrajectoryError
+from gvo.errors import RecordingError
 from gvo.geometry import se3
 from gvo.io.poses.inputs import read_compared
 from gvo.io.poses.inputs import read_ground_truth as read_poses
@@ -180,22 +180,3 @@ def test_a_folder_of_ros2_is_a_bag(tmp_path: Path) -> None:
     bag = PoseBag(tmp_path / "d.mcap")
     bag.pose("/gt_pose", ODOMETRY, 4, np.eye(4))
     assert read_poses(str(bag.write().parent)).stamps_ns.tolist() == [4]
-
-
-def test_what_is_neither_is_refused_in_one_line(bag: Path, tmp_path: Path) -> None:
-    for text in (str(tmp_path / "none.txt"), f"{tmp_path}/none.bag#/odom", f"{bag}#tf:map"):
-        with pytest.raises(GvoError) as caught:
-            read_poses(text)
-        assert "\n" not in str(caught.value)
-    with pytest.raises(TrajectoryError, match="expected two frames"):
-        read_poses(f"{bag}#tf:map")
-
-
-@pytest.mark.recorded
-def test_recorded_streams_of_other_rates_than_the_truth_are_compared(gvo_data: Path) -> None:
-    """The truth comes each 60 ms, the estimate each 67 ms: hardly any stamps are equal."""
-    path = gvo_data / "bags/good/pose_streams.bag"
-    truth, estimate = read_poses(f"{path}#groundtruth"), read_poses(f"{path}#ORB-SLAM")
-    found = evaluate(truth, estimate, name="ORB-SLAM")
-    assert found.n > 0.9 * len(estimate)
-    assert found.path_ratio == pytest.approx(1.0, abs=0.02)

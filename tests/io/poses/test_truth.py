@@ -69,17 +69,6 @@ def test_the_truth_of_the_base_becomes_that_of_the_camera(seed: int) -> None:
     assert (evaluation.ate_m, evaluation.rpe_deg) == pytest.approx((0.0, 0.0), abs=1e-5)
 
 
-def test_a_frame_asked_for_counts_not_the_camera() -> None:
-    T_map_cam = motion() @ T_BASE_CAM
-    found = framed(
-        truth_of(trajectory(T_map_cam), "cam"), mounted(), base_frame="base", camera_frame="cam"
-    )
-    np.testing.assert_allclose(found.trajectory.T_world_frame, motion(), atol=1e-9)
-    same = framed(truth_of(trajectory(T_map_cam), "cam"), TfBuffer(), camera_frame="cam")
-    np.testing.assert_array_equal(same.trajectory.T_world_frame, T_map_cam)
-    assert same.decision == "it was read"
-
-
 def test_the_truth_of_the_camera_follows_its_mount_from_tf_or_from_a_file() -> None:
     truth = truth_of(trajectory(motion() @ T_BASE_CAM), "ground_truth", is_of_camera=True)
     assert framed(truth, TfBuffer()).trajectory is truth.trajectory
@@ -158,19 +147,6 @@ def test_an_antenna_whose_place_is_not_known_is_compared_with_a_warning() -> Non
         assert reason in found.warning
         assert found.warning.endswith("the errors include its lever arm")
         np.testing.assert_array_equal(found.T_base_point, np.eye(4))
-
-
-def test_a_point_without_a_frame_is_the_frame_itself() -> None:
-    positions = Trajectory.of_positions(np.arange(3), np.eye(3))
-    found = framed(truth_of(positions, ""), TfBuffer(), camera_frame="cam")
-    assert not found.warning
-    assert found.trajectory is positions
-
-
-def test_a_mount_from_a_file_names_the_frame_of_the_truth() -> None:
-    truth = truth_of(trajectory(motion()), "vicon/drone")
-    found = framed(truth, TfBuffer(), base_frame="vicon/drone", T_base_cam=T_BASE_CAM)
-    assert found.trajectory is truth.trajectory
 
 
 def robot(path: Path, *, truth: str) -> BagReader:

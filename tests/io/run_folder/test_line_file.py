@@ -6,9 +6,7 @@ from typing import Any
 
 import pytest
 
-from gvo.io.run_folder.line_file import LineFile, append_whole, replace_text
-
-HEADER = "stamp,x\n"
+from gvo.io.run_folder.line_file import append_whole, replace_text
 
 
 class SmallDisk(io.FileIO):
@@ -29,15 +27,6 @@ def test_what_fits_is_written_whole_and_what_does_not_not_at_all(tmp_path: Path)
         assert (tmp_path / "file").read_bytes() == b"a" * 60
         append_whole(file, b"c" * 40)
     assert (tmp_path / "file").read_bytes() == b"a" * 60 + b"c" * 40
-
-
-def test_a_file_that_is_there_is_replaced(tmp_path: Path) -> None:
-    path = tmp_path / "file"
-    path.write_text("old\n")
-    file = LineFile(path, HEADER)
-    file.write("0,0\n")
-    file.close()
-    assert path.read_text() == HEADER + "0,0\n"
 
 
 def test_a_text_is_replaced_whole_or_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

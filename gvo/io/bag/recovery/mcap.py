@@ -26,10 +26,24 @@ from gvo.io.bag.recovery.inflate import MAX_INFLATED, DamageError
 from gvo.io.bag.recovery.scan import Channel, Losses, Record, Scan, Window, standard_type
 
 _MAGIC = b"\x89MCAP0\r\n"
+
+
+class _ChannelHead(ChannelRecord):
+    """A channel read without its metadata, which nobody needs and which may be damaged."""
+
+    @staticmethod
+    def read(stream: ReadDataStream) -> ChannelRecord:
+        number, schema = stream.read2(), stream.read2()
+        topic, encoding = stream.read_prefixed_string(), stream.read_prefixed_string()
+        return ChannelRecord(
+            id=number, topic=topic, message_encoding=encoding, metadata={}, schema_id=schema
+        )
+
+
 _KINDS: dict[int, Any] = {
     Opcode.FOOTER: Footer,
     Opcode.SCHEMA: Schema,
-    Opcode.CHANNEL: ChannelRecord,
+    Opcode.CHANNEL: _ChannelHead,
     Opcode.MESSAGE: Message,
     Opcode.CHUNK_INDEX: ChunkIndex,
 }
