@@ -165,13 +165,3 @@ def test_the_view_of_the_colour_camera_itself_changes_no_bit(is_rectified: bool)
     depth[100:120, 50:90] = np.nan
     registered = DepthRegistration(Calibration.from_camera(_COLOR), view)(depth)
     np.testing.assert_array_equal(registered, depth)
-
-
-def test_unknown_depth_stays_unknown_and_moves_with_what_surrounds_it() -> None:
-    depth = np.full((480, 640), 2.0, np.float32)
-    depth[200:240, 300:340] = np.nan
-    T_color_depth = make_transform(np.eye(3), np.array([10.2 * 2.0 / 525, 0.0, 0.0]))
-    registered = _registration(_COLOR, T_color_depth)(depth)
-    expected = np.full((480, 640), np.nan, np.float32)
-    expected[:, 10:] = depth[:, :-10]  # 10.2 pixels to the right
-    np.testing.assert_array_equal(registered, expected)

@@ -131,11 +131,3 @@ def test_an_excerpt_after_the_end_tells_how_long_the_recording_is() -> None:
 def test_numbers_out_of_range_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=f"{next(iter(options))} must be"):
         Excerpt(**options)
-
-
-@pytest.mark.parametrize(
-    "excerpt", [Excerpt(), Excerpt(start_s=4.0), Excerpt(duration_s=2.0), Excerpt(every=7)]
-)
-def test_the_expected_number_is_that_of_an_even_recording(excerpt: Excerpt) -> None:
-    n_taken = len(list(take_excerpt(_items(_TENTHS), excerpt)))
-    assert excerpt.n_expected(len(_TENTHS), length_s=5.0) == n_taken

@@ -3,7 +3,6 @@
 import json
 import threading
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +12,9 @@ import pytest
 
 from gvo.config import Config, RuntimeConfig, SyncConfig
 from gvo.errors import CalibrationError, RecordingError
-from gvo.geometry.camera import Calibration, PinholeCamera, StereoCamera
-from gvo.io.depth_registration import DepthRegistration
+from gvo.geometry.camera import Calibration, StereoCamera
 from gvo.io.frames import Rig, frames, refuse_repeats
-from gvo.io.recording import DepthView, StampedImage
+from gvo.io.recording import StampedImage
 from gvo.types import FaultyFrame, Frame, RgbdFrame, StereoFrame
 
 _THREADS = pytest.mark.parametrize("threads", [1, 2, 4])
@@ -165,27 +163,6 @@ def test_only_images_of_a_free_running_sensor_may_be_left_out(tiny: Any) -> None
         kept = list(frames(source, Config(), with_unpaired=False))
         assert len(kept) == n_kept
         assert [item.stamp_ns for item in kept] == [item.stamp_ns for item in read[:n_kept]]
-
-
-def _seen_from_beside() -> DepthView:
-    """Return a depth camera of half the size, two centimetres left of the colour camera."""
-    camera = PinholeCamera(fx=25.0, fy=25.0, cx=11.5, cy=7.5, width=24, height=16)
-    T_color_depth = np.eye(4)
-    T_color_depth[0, 3] = -0.02
-    return DepthView(calibration=Calibration.from_camera(camera), T_color_depth=T_color_depth)
-
-
-@_THREADS
-def test_depth_of_a_camera_of_its_own_is_registered(tiny: Any, threads: int) -> None:
-    view = _seen_from_beside()
-    depth = np.random.default_rng(0).uniform(1.0, 1.1, (16, 24)).astype(np.float32)
-    source = tiny.rgbd([(0, 5, tiny.texture(1)), (1, 5, depth)])
-    source.info = replace(source.info, depth_view=view)
-    (frame,) = _read(source, threads)
-    expected = DepthRegistration(source.info.calibrations[0], view)(depth)
-    assert np.isfinite(expected).mean() > 0.8
-    np.testing.assert_array_equal(frame.depth, expected)
-    np.testing.assert_array_equal(frame.image, tiny.texture(1))
 
 
 @_THREADS

@@ -141,12 +141,6 @@ def test_an_image_without_a_partner_says_how_far_the_nearest_is(limit_ms: int) -
     assert "there is none" in str(_pair([100], [], limit_ns=limit_ms)[0])
 
 
-def test_an_image_says_that_another_one_got_its_partner() -> None:
-    ms = 1_000_000
-    taken = _pair([0, 5 * ms], [1 * ms], limit_ns=20 * ms)[1]
-    assert str(taken).endswith("the nearest is 4 ms away and belongs to another image")
-
-
 @pytest.mark.parametrize("limit_ns", [0, _LIMIT])
 @pytest.mark.parametrize(("late", "word"), [(200, "repeats"), (150, "goes back from 200 to 150")])
 def test_a_pair_whose_stamp_does_not_advance_is_faulty(late: int, word: str, limit_ns: int) -> None:
@@ -155,15 +149,6 @@ def test_a_pair_whose_stamp_does_not_advance_is_faulty(late: int, word: str, lim
     assert pairs[:2] == [(100, 100), (200, 200)]
     assert word in str(pairs[2])
     assert pairs[3] == (300, 300)
-
-
-def test_of_two_images_of_one_stamp_one_is_paired_and_the_other_is_faulty() -> None:
-    repeated, pair = _pair([100, 100], [100], limit_ns=0)
-    assert "repeats" in str(repeated)
-    assert pair == (100, 100)
-    pair, repeated = _pair([100, 100], [100])
-    assert "repeats" in str(repeated)
-    assert pair == (100, 100)
 
 
 def test_a_wrong_stamp_without_partner_does_not_spoil_those_after_it() -> None:
@@ -243,27 +228,6 @@ def test_each_image_comes_through_or_is_taken_out(steps: list[tuple[int, int]]) 
         assert order == sorted(order)
     n_left = sum(image.stream == 0 for image in through)
     assert n_left + len(stray.take_faulty()) == sum(stream == 0 for stream, _ in steps)
-
-
-def test_nothing_waits_while_stamps_go_on_evenly() -> None:
-    def images() -> Iterator[StampedImage]:
-        for number in range(3):
-            yield _image(0, number * _S // 10)
-        raise AssertionError("one more was asked for")
-
-    sound = StampFilter(images()).images()
-    assert [next(sound).stamp_ns for _ in range(3)] == [0, _S // 10, _S // 5]
-
-
-def test_what_waits_is_given_before_an_error() -> None:
-    def images() -> Iterator[StampedImage]:
-        yield from (_image(0, 0), _image(0, 5 * _S), _image(1, 5 * _S))
-        raise RecordingError("cut off")
-
-    sound = StampFilter(images()).images()
-    assert sorted(next(sound).stamp_ns for _ in range(3)) == [0, 5 * _S, 5 * _S]
-    with pytest.raises(RecordingError, match="cut off"):
-        next(sound)
 
 
 def test_the_reason_tells_how_far_ahead_the_stamp_is() -> None:

@@ -32,7 +32,15 @@ from gvo.io.bag.topics import (
 from gvo.io.calibration.files import CalibrationPaths, paths_of
 from gvo.io.images import MILLIMETRES, GreyRange
 from gvo.io.poses.tf import TfBuffer, read_tf
-from gvo.io.poses.truth import TRUTH_FRAMES, BagTruthSpec, Truth, find_truth
+from gvo.io.poses.truth import (
+    TRUTH_FRAMES,
+    BagTruthSpec,
+    Poses,
+    Truth,
+    find_named_truth,
+    in_frame,
+    read_poses,
+)
 from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FloatArray
@@ -178,11 +186,18 @@ class BagSource:
             When the bag does not hold what was asked for.
         """
         whole = self.transforms(TRUTH_FRAMES)
-        return find_truth(
-            self._reader,
-            spec,
-            buffer=whole if whole.is_whole else None,
-            where=self._where,
+        buffer = whole if whole.is_whole else None
+        found: Poses | Failure
+        if spec is None:
+            found = find_named_truth(self._reader, self._where, buffer)
+        else:
+            found = read_poses(self._reader, spec, where=self._where, buffer=buffer)
+        if isinstance(found, Failure):
+            return found
+        frames = [found.child_frame, base_frame, self.info.frame_id]
+        return in_frame(
+            found,
+            self.transforms([name for name in frames if name]),
             base_frame=base_frame,
             camera_frame=self.info.frame_id,
             T_base_cam=T_base_cam,

@@ -7,13 +7,11 @@ rectified camera (x right, y down, z forward), as in image_geometry and stereo_i
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal, TypeAlias
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from gvo._text import plain_number
 from gvo.errors import ConfigurationError, RecordingError, TrajectoryError
@@ -22,13 +20,13 @@ from gvo.io.bag.messages import bare
 from gvo.io.bag.source import BagSource
 from gvo.io.poses.tf import TfBuffer, list_names
 from gvo.io.recording import Source
+from gvo.trajectory.g2o import transforms_of
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Edge, Estimate, Failure, FloatArray, IntArray, Loop
 
 InitialPose: TypeAlias = FloatArray | Literal["truth"]
 Mount: TypeAlias = Callable[[int], tuple[FloatArray, bool]]
 
-_NORM_TOLERANCE = 1e-2
 _ROTATION_TOLERANCE = 1e-3
 
 
@@ -331,23 +329,18 @@ def parse_initial_pose(text: str) -> InitialPose:
     """
     if text.strip() == "truth":
         return "truth"
+    expected = "expected X,Y,Z or X,Y,Z,QX,QY,QZ,QW (metres), or truth"
     try:
-        numbers = np.array([float(plain_number(word)) for word in text.split(",")])
+        numbers = [float(plain_number(word)) for word in text.split(",")]
     except ValueError:
-        numbers = np.empty(0)
-    if len(numbers) not in (3, 7) or not np.isfinite(numbers).all():
-        raise ConfigurationError(
-            f"--initial-pose {text!r}: expected X,Y,Z or X,Y,Z,QX,QY,QZ,QW (metres), or truth"
-        )
-    quaternion_xyzw = numbers[3:] if len(numbers) == 7 else np.array([0.0, 0.0, 0.0, 1.0])
-    norm = math.hypot(*quaternion_xyzw)  # squares of huge numbers overflow
-    if abs(norm - 1.0) > _NORM_TOLERANCE:
-        raise ConfigurationError(
-            f"--initial-pose {text!r}: the quaternion QX,QY,QZ,QW has the norm {norm:.4g}, "
-            "expected 1"
-        )
-    R = np.asarray(Rotation.from_quat(quaternion_xyzw).as_matrix())
-    return se3.make_transform(R, numbers[:3])
+        numbers = []
+    numbers += [0.0, 0.0, 0.0, 1.0] if len(numbers) == 3 else []
+    if len(numbers) != 7 or not np.isfinite(numbers).all():
+        raise ConfigurationError(f"--initial-pose {text!r}: {expected}")
+    try:
+        return np.asarray(transforms_of(np.array([numbers]))[0])
+    except ValueError as error:
+        raise ConfigurationError(f"--initial-pose {text!r}: {error}; {expected}") from None
 
 
 def _rigid(name: str, T: FloatArray) -> FloatArray:

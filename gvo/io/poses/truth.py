@@ -243,64 +243,6 @@ class Truth:
         return estimate.transformed(self.T_base_point)
 
 
-def find_truth(
-    reader: MessageReader,
-    spec: BagTruthSpec | None = None,
-    *,
-    where: str,
-    base_frame: str = "",
-    camera_frame: str = "",
-    T_base_cam: FloatArray | None = None,
-    buffer: TfBuffer | None = None,
-) -> Truth | Failure:
-    """Read the true poses that `spec` names, else those named as truth, as poses of the base frame.
-
-    Where the messages name no child frame, they are taken for poses of the base frame. Positions
-    without rotations stay: estimates are moved to the point instead, by `Truth.comparable`; where
-    the place of the point in the base frame is not known it is taken for its origin, with a
-    warning.
-
-    Parameters
-    ----------
-    reader : MessageReader
-    spec : TfTruth or str, optional
-        What to read; where omitted, frame `ground_truth`, or the only topic with such a name.
-    where : str
-        The bag, for messages.
-    base_frame : str
-        Its name in tf; empty: the rectified camera.
-    camera_frame : str
-        Of the rectified camera in tf; empty where the recording names none.
-    T_base_cam : ndarray of float64, shape (4, 4), optional
-        Where the camera is mounted on it, metres, if that does not come from tf.
-    buffer : TfBuffer, optional
-        Of the bag, with all its frames; read where omitted and needed.
-
-    Returns
-    -------
-    Truth or Failure
-        The failure says why there is none, or why it cannot be brought to the base frame.
-
-    Raises
-    ------
-    RecordingError
-        When the bag cannot be read, or does not hold what was asked for.
-    """
-    found: Poses | Failure
-    if spec is None:
-        found = find_named_truth(reader, where, buffer)
-    else:
-        found = read_poses(reader, spec, where=where, buffer=buffer)
-    if isinstance(found, Failure):
-        return found
-    if buffer is None:
-        frames = {bare(name) for name in (found.child_frame, base_frame, camera_frame) if name}
-        buffer = read_tf(reader, frames=frames) if len(frames) > 1 else TfBuffer()
-    return in_frame(
-        found, buffer, base_frame=base_frame, camera_frame=camera_frame, T_base_cam=T_base_cam
-    )
-
-
 def in_frame(
     found: Poses,
     buffer: TfBuffer,
@@ -309,7 +251,30 @@ def in_frame(
     camera_frame: str = "",
     T_base_cam: FloatArray | None = None,
 ) -> Truth | Failure:
-    """Bring true poses to the base frame; the arguments are those of `find_truth`."""
+    """Bring true poses to the base frame.
+
+    Where the messages name no child frame, they are taken for poses of the base frame. Positions
+    without rotations stay: estimates are moved to the point instead, by `Truth.comparable`; where
+    the place of the point in the base frame is not known it is taken for its origin, with a
+    warning.
+
+    Parameters
+    ----------
+    found : Poses
+    buffer : TfBuffer
+        Of the bag.
+    base_frame : str
+        Its name in tf; empty: the rectified camera.
+    camera_frame : str
+        Of the rectified camera in tf; empty where the recording names none.
+    T_base_cam : ndarray of float64, shape (4, 4), optional
+        Where the camera is mounted on it, metres, if that does not come from tf.
+
+    Returns
+    -------
+    Truth or Failure
+        The failure says why they cannot be brought to the base frame.
+    """
     camera_frame, base_frame = bare(camera_frame), bare(base_frame)
     child = camera_frame if found.is_of_camera else bare(found.child_frame)
     is_camera = T_base_cam is None and not base_frame

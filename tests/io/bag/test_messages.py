@@ -59,14 +59,6 @@ def test_colours_come_in_the_order_blue_green_red(
     np.testing.assert_array_equal(decode_grey_or_color(message, "/image"), bgr)
 
 
-@pytest.mark.parametrize("is_bigendian", [False, True])
-@pytest.mark.parametrize("encoding", ["mono16", "16UC1"])
-def test_sixteen_bit_grey_is_shifted_to_eight(tiny: Any, encoding: str, is_bigendian: bool) -> None:
-    grey = tiny.texture(1)
-    message = _message(grey * np.uint16(256) + 3, encoding, is_bigendian=is_bigendian)
-    np.testing.assert_array_equal(decode_grey_or_color(message, "/image"), grey)
-
-
 _PATTERNS = ["rggb", "bggr", "gbrg", "grbg"]
 
 
@@ -268,11 +260,6 @@ def test_compressed_depth_of_integers_is_exact(tiny: Any, format_: str, n_header
     message.data = np.concatenate([np.zeros(n_header, np.uint8), message.data])
     depth = decode_compressed_depth(message, 5000.0, "/depth")
     np.testing.assert_array_equal(depth, tiny.depth(1))
-
-
-def test_depth_in_metres_may_come_as_tiff(tiny: Any) -> None:
-    message = _compressed(tiny.depth(1), "32FC1; tiff compressed ", ".tiff")
-    np.testing.assert_array_equal(decode_compressed_depth(message, 5000.0, "/depth"), tiny.depth(1))
 
 
 @pytest.mark.parametrize("data", [b"", b"x", bytes(12), bytes(40)])

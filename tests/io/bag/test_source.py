@@ -61,18 +61,6 @@ def test_a_stereo_pair_is_read_with_its_calibration(tmp_path: Path, tiny: Any) -
     np.testing.assert_array_equal(read[1].right, tiny.texture(3))
 
 
-def test_raw_images_are_undistorted_rectified_ones_are_not(tmp_path: Path, tiny: Any) -> None:
-    D = np.array([-0.2, 0.1, 0.0, 0.0, 0.0])
-    raw = BagSource(write(tmp_path / "raw.bag", _stereo(tiny, "image_raw", D=D)))
-    assert not raw.info.calibrations[0].is_rectified
-    np.testing.assert_array_equal(raw.info.calibrations[1].D, D)
-    rectified = BagSource(write(tmp_path / "rect.bag", _stereo(tiny, D=D)))
-    assert rectified.info.calibrations[0].is_rectified
-    (frame, *_) = frames(rectified, Config())
-    assert isinstance(frame, StereoFrame)
-    np.testing.assert_array_equal(frame.left, tiny.texture(0))
-
-
 def _scaled(scale: float | None) -> Config:
     return Config.model_validate({"depth": {"scale": scale}})
 

@@ -20,7 +20,6 @@ from gvo.io.calibration.files import (
 )
 from gvo.types import FloatArray
 
-_P = [40.0, 0, 20.5, -20.0, 0, 41.0, 10.5, 0, 0, 0, 1, 0]
 _SIZE = (752, 480)
 _K = (
     np.array([[458.654, 0, 367.215], [0, 457.296, 248.375], [0, 0, 1]]),
@@ -250,26 +249,6 @@ def test_what_opencv_calibrates_is_read(
     assert calibration.K[1, 1] == 51.0
 
 
-@pytest.mark.parametrize("names", ["kdrp", "KDRP"])
-def test_both_spellings_of_a_file_say_the_same(tmp_path: Path, tiny: Any, names: str) -> None:
-    long = tiny.ros_camera(
-        rectification_matrix={"data": np.eye(3).ravel().tolist()}, projection_matrix={"data": _P}
-    )
-    k, d, r, p = list(names)
-    short = {
-        "width": 48,
-        "height": 32,
-        "distortion_model": "plumb_bob",
-        k: tiny.camera.K.ravel().tolist(),
-        d: [0.0] * 5,
-        r: np.eye(3).ravel().tolist(),
-        p: _P,
-    }
-    made = [_rgbd(_write(tmp_path / "c.yaml", c)).calibrations[0] for c in (long, short)]
-    for name in "KDRP":
-        np.testing.assert_array_equal(getattr(made[0], name), getattr(made[1], name))
-
-
 def test_a_message_as_printed_is_a_file_with_its_binning_and_region(tmp_path: Path) -> None:
     text = """header:
   frame_id: camera
@@ -343,16 +322,7 @@ def test_a_malformed_chain_is_refused(tmp_path: Path, changes: dict[str, Any], t
 @pytest.mark.parametrize(
     "text",
     [
-        "a: [",
-        "",
-        "- 1",
-        "\x00",
-        "a: 2024-99-99",
-        "a: 0b2",
-        "a: " + "[" * 1000,
-        "a: !!bool x",
-        "a: !!int ''",
-        "a: !!timestamp x",
+        *("a: [", "", "- 1", "\x00", "a: " + "[" * 1000, "a: !!int ''"),
         "%YAML:1.0\n---\na: !!opencv-matrix 3",
     ],
 )

@@ -245,24 +245,6 @@ def test_the_cameras_stand_in_tf_before_the_first_image(tmp_path: Path, name: st
         assert body[0] == min(log_time_ns for _, log_time_ns, _ in reader.messages())
 
 
-@_GENERATIONS
-def test_images_and_their_calibration_name_one_frame(tmp_path: Path, name: str) -> None:
-    source = _stereo()
-    source.info = replace(source.info, frame_id="camera_right_optical")
-    convert(source, tmp_path / name)
-    frames_of: dict[str, set[str]] = {}
-    with AnyReader([tmp_path / name]) as reader:
-        for connection, _, data in reader.messages():
-            if connection.topic.startswith("/stereo"):
-                message: Any = reader.deserialize(data, connection.msgtype)
-                side = connection.topic.split("/")[2]
-                frames_of.setdefault(side, set()).add(message.header.frame_id)
-    (left,), (right,) = frames_of["left"], frames_of["right"]
-    assert left == "camera_right_optical"
-    assert right != left
-    assert {pose[1:3] for pose in _transforms(tmp_path / name, "/tf_static")} == {(left, right)}
-
-
 def test_a_copy_of_a_bag_keeps_the_frame_and_the_body(tmp_path: Path) -> None:
     source = _stereo()
     T_body_cam = make_transform(_raw_pair()[0].R, np.array([0.3, -0.2, 0.1]))

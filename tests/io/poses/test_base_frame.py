@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gvo.errors import ConfigurationError, RecordingError, TrajectoryError
+from gvo.errors import ConfigurationError, RecordingError
 from gvo.geometry import se3
 from gvo.io.poses.base_frame import BaseFrame, mount_by_tf, parse_initial_pose
 from gvo.io.poses.tf import TfBuffer
@@ -156,18 +156,6 @@ def test_where_tf_starts_late_and_ends_early_the_nearest_transform_is_taken_and_
     assert frame.n_guessed == 3
 
 
-def test_the_first_frame_may_be_named_and_its_pose_given_late() -> None:
-    rng = np.random.default_rng(2)
-    drive, T_truth = camera_drive(rng), random_transform(rng)
-    frame = BaseFrame()
-    frame.start(STAMPS_NS[0], T_truth)
-    np.testing.assert_allclose(
-        frame.apply(drive[3]).T_world_frame, T_truth @ drive[3].T_world_frame, atol=1e-12
-    )
-    with pytest.raises(ValueError, match="already"):
-        frame.start(STAMPS_NS[1])
-
-
 @pytest.mark.parametrize(
     ("frame", "camera", "words"),
     [
@@ -208,13 +196,6 @@ def test_true_poses_of_the_camera_become_those_of_the_frame_in_its_world(is_movi
     for n, T_world_base in enumerate(truth.T_world_frame):
         T = T_base_cam[n] if is_moving else T_base_cam[0]
         np.testing.assert_allclose(T_world_base @ T, drive[n + first].T_world_frame, atol=1e-9)
-
-
-def test_positions_alone_are_not_moved_to_another_frame() -> None:
-    positions = Trajectory.of_positions(np.arange(3), np.zeros((3, 3)))
-    assert BaseFrame().convert(positions) is positions
-    with pytest.raises(TrajectoryError, match="from the camera to base_link"):
-        BaseFrame("base_link", np.eye(4)).convert(positions)
 
 
 def test_the_initial_pose_is_read_with_and_without_a_rotation() -> None:

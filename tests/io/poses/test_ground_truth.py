@@ -161,18 +161,6 @@ def test_the_only_topic_of_such_a_name_is_taken_beside_odometry(tmp_path: Path, 
     assert truth.decision.startswith(f"/mocap/robot ({type_}), 1 poses")
 
 
-def test_of_several_none_is_taken_and_all_are_listed(tmp_path: Path) -> None:
-    bag = PoseBag(tmp_path / "a.mcap")
-    for name in ("/vicon/drone", "/vicon/wand"):
-        bag.pose(name, TRANSFORM, 1, POSE)
-    found = find(bag.write())
-    assert isinstance(found, Failure)
-    assert found.reason == (
-        f"2 topics are named as ground truth: /vicon/drone ({TRANSFORM}), /vicon/wand "
-        f"({TRANSFORM}); choose by --ground-truth topic:/vicon/drone"
-    )
-
-
 def test_odometry_and_fixes_are_never_taken(tmp_path: Path) -> None:
     bag = PoseBag(tmp_path / "a.bag")
     bag.pose("/odom", ODOMETRY, 1, POSE)

@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 import gvo
 from gvo.errors import RecordingError, TrajectoryError
-from gvo.io.bag.source import read_transforms
 from gvo.io.poses.base_frame import BaseFrame, find_base_frame
 from gvo.io.poses.inputs import read_compared, read_ground_truth, read_truth, recorded_truth
 from gvo.io.poses.truth import Truth, initial_pose
@@ -23,7 +22,6 @@ from tests.make.rendered_walk import (
     START_NS,
     T_BASE_CAM,
     Walk,
-    copy_messages,
     on_a_robot,
     true_poses,
 )
@@ -32,13 +30,6 @@ from tests.make.rendered_walk import (
 @pytest.fixture
 def robot(walk_bag: Path, tmp_path: Path) -> Source:
     return gvo.open_recording([walk_bag, on_a_robot(tmp_path / "tf.mcap").write()])
-
-
-def test_the_camera_is_the_frame_that_nobody_asked_for(robot: Source) -> None:
-    frame = find_base_frame(robot)
-    assert frame.is_camera
-    assert frame.name == CAMERA
-    assert find_base_frame(Walk()).is_camera
 
 
 @pytest.mark.parametrize("name", ["base_link", "/base_link"])
@@ -56,19 +47,6 @@ def test_a_frame_that_nothing_connects_is_refused(robot: Source, walk_bag: Path)
         find_base_frame(gvo.open_recording(walk_bag), "base_link")
     with pytest.raises(RecordingError, match=r"walk: --frame body: .*--calibration FILE"):
         find_base_frame(Walk(), "body")
-
-
-def test_transforms_are_where_a_bag_has_them(robot: Source, walk_bag: Path, tmp_path: Path) -> None:
-    buffer = read_transforms(robot, ["base_link", ""])
-    assert buffer is not None
-    assert "base_link" in buffer.frames
-    images = copy_messages(
-        [walk_bag], tmp_path / "images.mcap", lambda topic, _: "/tf" not in topic
-    )
-    empty = read_transforms(gvo.open_recording(images), ["base_link"])
-    assert empty is not None
-    assert empty.frames == ()
-    assert read_transforms(Walk(), ["base_link"]) is None
 
 
 def test_poses_of_a_frame_out_of_reach_are_refused_if_asked(walk_bag: Path, tmp_path: Path) -> None:
@@ -143,13 +121,6 @@ def test_true_poses_are_read_from_files_folders_and_bags(tmp_path: Path) -> None
         found = read_ground_truth(str(text))
         np.testing.assert_array_equal(found.stamps_ns, truth.stamps_ns)
         np.testing.assert_allclose(found.T_world_frame, truth.T_world_frame, atol=1e-8)
-
-
-def test_a_recording_without_truth_is_no_reference(tmp_path: Path, walk_bag: Path) -> None:
-    with pytest.raises(RecordingError, match="name the poses"):
-        read_ground_truth(walk_bag)
-    with pytest.raises(TrajectoryError, match=r"none\.txt"):
-        read_ground_truth(tmp_path / "none.txt")
 
 
 def test_estimates_get_the_shortest_names_that_differ(tmp_path: Path) -> None:

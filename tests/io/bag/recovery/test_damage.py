@@ -283,43 +283,41 @@ def _fill_page(data: bytes, start: int) -> bytes:
     return data[:start] + b"\xff" * 4096 + data[start + 4096 :]
 
 
-_HUGE = [2**32 - 1, 2**64 - 1]
+def _check_memory(path: Path) -> None:
+    tracemalloc.start()
+    messages = _read(_scan(path))
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert messages[: len(_ALL)] == _ALL
+    assert peak < 4_000_000
 
 
-@pytest.mark.parametrize("size", _HUGE)
 @pytest.mark.parametrize("op", range(1, 16))
-def test_a_claimed_size_is_not_allocated_in_mcap(tmp_path: Path, op: int, size: int) -> None:
+def test_a_claimed_size_is_not_allocated_in_mcap(tmp_path: Path, op: int) -> None:
     path = tmp_path / "a.mcap"
-    good = open_mcap(_MESSAGES, "lz4")
-    path.write_bytes(good + struct.pack("<BQ", op, size) + bytes(200))
-    _check_memory(path)
-    # a string, a list, the data of a chunk, all longer than their record
-    for n_bytes in range(0, 60, 12):
-        content = bytes(n_bytes) + struct.pack("<Q", size) + b"\xff" * 100
-        path.write_bytes(good + struct.pack("<BQ", op, len(content)) + content)
+    good, huge = open_mcap(_MESSAGES, "lz4"), struct.pack("<Q", 2**64 - 1)
+    # the record itself; a string, a list, the data of a chunk, all longer than their record
+    contents = [bytes(n_bytes) + huge + b"\xff" * 100 for n_bytes in range(0, 60, 12)]
+    records = [struct.pack("<Q", len(content)) + content for content in contents]
+    for record in (huge + bytes(200), *records):
+        path.write_bytes(good + bytes([op]) + record)
         _check_memory(path)
 
 
-@pytest.mark.parametrize("size", [2**31, 2**32 - 1])
 @pytest.mark.parametrize("op", range(2, 8))
-@pytest.mark.parametrize("compression", [b"none", b"bz2", b"lz4"])
+@pytest.mark.parametrize("compression", [b"none", b"lz4"])
 def test_a_claimed_size_is_not_allocated_in_ros1(
-    bags: dict[str, Path], op: int, size: int, compression: bytes
+    bags: dict[str, Path], op: int, compression: bytes
 ) -> None:
-    number = struct.pack("<I", size)
-    fields = (b"op=" + bytes([op]), b"conn=" + number, b"count=" + number, b"size=" + number,
-              b"compression=" + compression, b"index_pos=" + number, b"time=" + 2 * number,
-              b"chunk_count=" + number)  # fmt: skip
+    number = struct.pack("<I", 2**32 - 1)
+    names = (b"conn=", b"count=", b"size=", b"index_pos=", b"chunk_count=")
+    fields = [b"op=" + bytes([op]), b"compression=" + compression, b"time=" + 2 * number]
+    fields += [name + number for name in names]
     header = b"".join(struct.pack("<I", len(field)) + field for field in fields)
-    for record in (
-        struct.pack("<I", len(header)) + header + number,
-        struct.pack("<I", len(header)) + header + struct.pack("<I", 100),
-        number + header,
-        struct.pack("<I", 8) + number + b"op=\x05" + number,
-    ):
-        for tail in (bytes(200), b"\xff" * 200):
-            path = damaged(bags["lz4.bag"], partial(_without_index, tail=record + tail))
-            _check_memory(path)
+    head = struct.pack("<I", len(header)) + header
+    for record in (head + number, head + struct.pack("<I", 100), number + header):
+        tail = record + b"\xff" * 200
+        _check_memory(damaged(bags["lz4.bag"], partial(_without_index, tail=tail)))
 
 
 def _check_memory(path: Path) -> None:
