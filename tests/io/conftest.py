@@ -32,7 +32,7 @@ class ListSource:
         calibrations: tuple[Calibration, ...],
         truth: Trajectory | None = None,
     ) -> None:
-        self._items = items
+        self.items = items
         self._truth = truth
         self.info = RecordingInfo(
             name="list",
@@ -42,7 +42,7 @@ class ListSource:
         )
 
     def images(self) -> Iterator[StampedImage]:
-        for stream, stamp_ns, pixels in self._items:
+        for stream, stamp_ns, pixels in self.items:
             yield StampedImage(stream=stream, stamp_ns=stamp_ns, load=partial(_give, pixels))
 
     def ground_truth(self) -> Trajectory | None:

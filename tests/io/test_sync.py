@@ -15,6 +15,52 @@ from gvo.types import FaultyFrame
 
 _LIMIT = 20
 _QUEUE = 100
+_rising_stamps = st.lists(st.integers(0, 300), unique=True, max_size=30).map(sorted)
+_KNOWN = [
+    ([100, 130], [85, 112], 20, 0.1, [(0, 1)]),
+    ([100, 130], [85, 112, 131], 20, 0.1, [(0, 1), (1, 2)]),
+    ([100, 200], [92, 110, 190, 210], 20, 0.1, [(0, 0), (1, 2)]),
+    ([100, 200], [92, 106, 190, 205], 20, 0.1, [(0, 1), (1, 3)]),
+    (
+        [0, 33, 67, 100, 133, 167, 200],
+        [10, 77, 143, 210],
+        20,
+        0.1,
+        [(0, 0), (2, 1), (4, 2), (6, 3)],
+    ),
+    (
+        [0, 33, 67, 100, 133, 167, 200],
+        [10, 77, 143, 210],
+        20,
+        1.0,
+        [(0, 0), (2, 1), (4, 2), (6, 3)],
+    ),
+    (
+        [0, 33, 66, 99, 132],
+        [16, 50, 82, 116, 148],
+        20,
+        0.1,
+        [(0, 0), (1, 1), (2, 2), (3, 3), (4, 4)],
+    ),
+    ([0, 33, 66, 99, 132], [16, 50, 82, 116, 148], 20, 0.0, [(0, 0), (2, 1), (3, 2), (4, 3)]),
+    ([0, 33, 66, 99, 132], [17, 49, 83, 115, 149], 20, 0.0, [(1, 0), (2, 1), (3, 2), (4, 3)]),
+    ([100, 200, 150, 300], [100, 200, 150, 300], 20, 0.1, [(0, 0), (1, 1), (3, 3)]),
+    ([100, 100, 130], [95, 100, 100, 131], 20, 0.1, [(0, 1), (2, 3)]),
+    ([100, 90, 110, 130], [95, 115, 105, 135], 20, 0.1, [(0, 0), (2, 1), (3, 3)]),
+    ([50, 40, 60], [45, 70], 20, 0.1, [(0, 0), (2, 1)]),
+    ([0, 10, 20, 30, 100], [31, 101], 40, 0.1, [(3, 0), (4, 1)]),
+    ([0, 10, 20, 31, 100], [31, 101], 40, 0.1, [(3, 0), (4, 1)]),
+    ([31, 101], [0, 10, 20, 30, 100], 40, 0.1, [(0, 3), (1, 4)]),
+    ([5, 26], [0, 21, 30], 20, 0.1, [(0, 0), (1, 2)]),
+    ([0, 20, 40, 60, 80], [19, 41, 59, 81], 20, 0.1, [(1, 0), (2, 1), (3, 2), (4, 3)]),
+    ([100, 200], [200, 100], 0, 0.1, [(1, 0)]),
+    ([1, 3, 2, 4], [1, 2, 3, 4], 0, 0.1, [(0, 0), (2, 1), (1, 2), (3, 3)]),
+    ([1, 1, 2], [1, 2, 2], 0, 0.1, [(1, 0), (2, 1)]),
+    # nearer by the penalty exactly, in floating point
+    ([10**8], [89_000_000, 110_000_000], 20_000_000, 0.1, [(0, 0)]),
+    ([100], [88, 110], 20, 0.1, [(0, 1)]),
+    ([100], [88, 110], 20, 0.5, [(0, 0)]),
+]
 _any_stamps = st.lists(st.integers(0, 400), max_size=30)
 _stamps = st.one_of(_any_stamps.map(sorted), _any_stamps)
 _order = st.lists(st.booleans(), max_size=60)
@@ -60,6 +106,54 @@ def _answered(answers: list[tuple[int, int] | str]) -> list[int]:
         answer[0] if isinstance(answer, tuple) else int(answer.partition(":")[0])
         for answer in answers
     ]
+
+
+def _pairs(first: list[int], second: list[int], age_penalty: float = 0.1) -> list[tuple[int, int]]:
+    answers = _pair(first, second, age_penalty=age_penalty)
+    return [answer for answer in answers if isinstance(answer, tuple)]
+
+
+@given(first=_rising_stamps, second=_rising_stamps, age_penalty=st.floats(0, 10))
+def test_pairs_keep_the_limit_and_the_order_and_use_each_image_once(
+    first: list[int], second: list[int], age_penalty: float
+) -> None:
+    pairs = _pairs(first, second, age_penalty)
+    assert all(abs(image - partner) <= _LIMIT for image, partner in pairs)
+    for stream in zip(*pairs, strict=True):
+        assert list(stream) == sorted(set(stream))
+
+
+@pytest.mark.parametrize(("first", "second", "limit_ns", "age_penalty", "places"), _KNOWN)
+def test_known_pairs_are_found(
+    first: list[int],
+    second: list[int],
+    limit_ns: int,
+    age_penalty: float,
+    places: list[tuple[int, int]],
+) -> None:
+    answers = _pair(first, second, limit_ns=limit_ns, age_penalty=age_penalty)
+    pairs = [answer for answer in answers if isinstance(answer, tuple)]
+    assert pairs == [(first[n], second[k]) for n, k in places]
+
+
+@pytest.mark.parametrize("limit_ns", [0, _LIMIT])
+def test_one_stream_may_run_ahead_as_far_as_the_queue_reaches(limit_ns: int) -> None:
+    stamps = list(range(0, 1000 * _QUEUE, 1000))
+    pairs = [(stamp, stamp) for stamp in stamps]
+    assert _pair(stamps, stamps, [False] * _QUEUE, limit_ns=limit_ns) == pairs
+    lost, *found = _pair([-1000, *stamps], stamps, [False] * (_QUEUE + 1), limit_ns=limit_ns)
+    assert str(lost).endswith("there is none, and 100 images wait already")
+    assert found == pairs
+
+
+def test_an_image_that_follows_a_given_up_one_is_no_pivot() -> None:
+    """The partner of depth 95 might have been the image at 96 that had to go."""
+    images = [_image(0, stamp) for stamp in (96, 100, 200)]
+    images += [_image(1, 95), _image(1, 201)]
+    answers = list(pair_images(images, limit_ns=20, partner="depth", queue_size=2))
+    assert isinstance(answers[0], FaultyFrame)
+    assert isinstance(answers[1], FaultyFrame)
+    assert isinstance(answers[2], tuple)
 
 
 @given(first=_stamps, second=_stamps, order=_order, limit_ns=st.sampled_from([0, _LIMIT]))

@@ -211,7 +211,7 @@ _messages = st.one_of(
 )
 
 
-@settings(max_examples=1500)
+@settings(max_examples=300)
 @given(messages=_messages, unit=_units, limit=_limits, age_penalty=_penalties)
 def test_the_pairs_are_those_of_message_filters_and_come_after_the_same_image(
     reference: Reference, messages: list[Message], unit: int, limit: int, age_penalty: float
@@ -221,7 +221,7 @@ def test_the_pairs_are_those_of_message_filters_and_come_after_the_same_image(
 
 
 @pytest.mark.acceptance
-@settings(max_examples=1500)
+@settings(max_examples=300)
 @given(messages=_messages, limit=_limits, age_penalty=_penalties, queue_size=st.integers(1, 6))
 def test_queues_overflow_as_those_of_message_filters(
     reference: Reference, messages: list[Message], limit: int, age_penalty: float, queue_size: int

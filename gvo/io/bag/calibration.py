@@ -214,12 +214,8 @@ def _lookup(buffer: TfBuffer, frames: tuple[str, str], stamp_ns: int) -> FloatAr
     found = buffer.lookup(*frames, stamp_ns)
     if not isinstance(found, Failure):
         return found
-    stamps_ns = buffer.edge_stamps_ns(*frames)
-    T, is_known = buffer.lookup_many(*frames, stamps_ns)
-    known = np.flatnonzero(is_known)
-    if len(known) == 0:
-        return found
-    return np.asarray(T[known[np.argmin(np.abs(stamps_ns[known] - stamp_ns))]])
+    stamps_ns, T = buffer.known(*frames)
+    return np.asarray(T[np.argmin(np.abs(stamps_ns - stamp_ns))]) if len(stamps_ns) else found
 
 
 def _of_realsense(

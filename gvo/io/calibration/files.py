@@ -314,8 +314,8 @@ def _of_matrices(content: Mapping[Any, Any], where: str) -> CameraFields:
     D = [] if values["D"] is None else values["D"]
     return CameraFields(
         where=where,
-        width=_positive(values["width"], "width", where),
-        height=_positive(values["height"], "height", where),
+        width=_integer(values["width"], f"{where}: width", least=1),
+        height=_integer(values["height"], f"{where}: height", least=1),
         model=str(content.get("distortion_model") or _assumed_model(content, D, where)),
         K=values["K"],
         D=D,
@@ -334,18 +334,13 @@ def _region(content: object, where: str) -> RegionOfInterest:
 
 
 def _count(content: Mapping[Any, Any], key: str, where: str) -> int:
-    value = content.get(key, 0)
-    if not isinstance(value, int) or not 0 <= value <= _MAX_COUNT:
-        raise CalibrationError(
-            f"{where}: {key} must be an integer of 0 or more, got {shortened(value)}"
-        )
-    return int(value)
+    return _integer(content.get(key, 0), f"{where}: {key}", least=0)
 
 
-def _positive(value: object, name: str, where: str) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or not 0 < value <= _MAX_COUNT:
+def _integer(value: object, what: str, *, least: int) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= _MAX_COUNT:
         raise CalibrationError(
-            f"{where}: {name} must be a positive integer, got {shortened(value)}"
+            f"{what} must be an integer of {least} or more, got {shortened(value)}"
         )
     return value
 

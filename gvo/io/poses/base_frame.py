@@ -274,11 +274,11 @@ def mount_by_tf(
             f"{where}: --frame {frame}: the images name no camera frame (their frame_id is "
             "empty); give T_body_cam by --calibration FILE"
         )
-    stamps_ns = buffer.edge_stamps_ns(frame, camera_frame)
-    _, is_known = buffer.lookup_many(frame, camera_frame, stamps_ns)
-    if np.any(is_known):
-        return _moving_mount(buffer, frame, camera_frame, stamps_ns[is_known])
-    T = buffer.lookup(frame, camera_frame, int(stamps_ns[0]) if len(stamps_ns) else 0)
+    stamps_ns, T_frame_camera = buffer.known(frame, camera_frame)
+    if len(stamps_ns):
+        return _moving_mount(buffer, frame, camera_frame, stamps_ns, T_frame_camera)
+    all_ns = buffer.edge_stamps_ns(frame, camera_frame)
+    T = buffer.lookup(frame, camera_frame, int(all_ns[0]) if len(all_ns) else 0)
     if not isinstance(T, Failure):
         return T
     is_named = {frame, camera_frame} <= set(buffer.frames)
@@ -290,16 +290,15 @@ def mount_by_tf(
 
 
 def _moving_mount(
-    buffer: TfBuffer, frame: str, camera_frame: str, known_stamps_ns: IntArray
+    buffer: TfBuffer, frame: str, camera_frame: str, stamps_ns: IntArray, known: FloatArray
 ) -> Mount:
+    """Return T_frame_camera over time; where it is not known, that of the nearest known stamp."""
+
     def mount(stamp_ns: int) -> tuple[FloatArray, bool]:
         T = buffer.lookup(frame, camera_frame, stamp_ns)
         if not isinstance(T, Failure):
             return T, False
-        after = int(np.searchsorted(known_stamps_ns, stamp_ns))
-        beside = known_stamps_ns[max(after - 1, 0) : after + 1]
-        nearest_ns = beside[np.argmin(np.abs(beside - stamp_ns))]
-        return buffer.lookup_many(frame, camera_frame, np.array([nearest_ns]))[0][0], True
+        return known[np.argmin(np.abs(stamps_ns - stamp_ns))], True
 
     return mount
 

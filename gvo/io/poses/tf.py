@@ -16,6 +16,7 @@ from gvo.errors import RecordingError
 from gvo.geometry import se3
 from gvo.io.bag.messages import bare, stamp_of
 from gvo.io.bag.reader import OLD_TF_TYPE, TF_TYPE, MessageReader
+from gvo.io.edges.events import InputFaults
 from gvo.trajectory.formats import MAX_POSITION_M
 from gvo.trajectory.trajectory import format_stamp
 from gvo.types import BoolArray, Failure, FloatArray, IntArray
@@ -25,8 +26,8 @@ TF_TYPES = (TF_TYPE, OLD_TF_TYPE)
 
 _N_NUMBERS = 7
 _SQUARED_NORM_TOLERANCE = 1e-2  # of quaternions, as in tf2
-# About 14 MB: up to here all transforms are kept, beyond it what was asked for.
-_N_KEPT_WHOLE = 200_000
+N_KEPT_WHOLE = 200_000
+"""Up to here all transforms are kept, 14 MB; beyond it what was asked for."""
 _N_LISTED = 12
 
 
@@ -39,18 +40,15 @@ class TfBuffer:
 
     Attributes
     ----------
-    n_refused : int
+    faults : InputFaults
         Invalid transforms, which were left out.
-    first_refused : str
-        The first of them in one line; empty if none.
     edges : set of (str, str)
         All pairs (parent, child) that ever were added.
     """
 
     def __init__(self) -> None:
         self.edges: set[tuple[str, str]] = set()
-        self.n_refused = 0
-        self.first_refused = ""
+        self.faults = InputFaults()
         self._numbers: dict[str, int] = {}
         self._names: list[str] = []
         self._moving: dict[str, _Log] = {}
@@ -75,11 +73,7 @@ class TfBuffer:
     @property
     def notes(self) -> list[str]:
         """Peculiarities of the transforms, a line each."""
-        notes = []
-        if self.n_refused:
-            notes.append(
-                f"tf: {self.n_refused} transforms were refused; the first: {self.first_refused}"
-            )
+        notes = [f"tf: {warning}" for warning in self.faults.warnings()]
         both = sorted(self._moving.keys() & self._static.keys())
         if both:
             notes.append(
@@ -121,8 +115,7 @@ class TfBuffer:
 
     def refuse(self, reason: str) -> None:
         """Count an invalid transform, for a reason of one line."""
-        self.n_refused += 1
-        self.first_refused = self.first_refused or reason
+        self.faults.add("transforms were refused", reason)
 
     def keep(self, children: Collection[str]) -> None:
         """Drop the transforms of all other children, also of messages to come.
@@ -208,6 +201,18 @@ class TfBuffer:
         paths = self._paths_over_time(bare(target), bare(source))
         found = (path for path in paths if isinstance(path, _Path))
         return self._stamps_ns({child for path in found for child in path.children})
+
+    def known(self, target: str, source: str) -> tuple[IntArray, FloatArray]:
+        """Return the stamps of `edge_stamps_ns` at which all of the path is known.
+
+        Returns
+        -------
+        stamps_ns : ndarray of int64, shape (n,)
+        T_target_source : ndarray of float64, shape (n, 4, 4)
+        """
+        stamps_ns = self.edge_stamps_ns(target, source)
+        T, is_known = self.lookup_many(target, source, stamps_ns)
+        return stamps_ns[is_known], T[is_known]
 
     def _number(self, name: str) -> int:
         number = self._numbers.setdefault(name, len(self._names))
@@ -462,7 +467,7 @@ def read_tf(reader: MessageReader, *, frames: Collection[str] | None = None) -> 
             buffer.keep(kept)
         for message, is_static in _transforms(reader, buffer):
             buffer.add_message(message, is_static=is_static)
-            if frames is not None and kept is None and len(buffer) > _N_KEPT_WHOLE:
+            if frames is not None and kept is None and len(buffer) > N_KEPT_WHOLE:
                 kept = _above(buffer, frames)
                 buffer.keep(kept)
         if kept is None or frames is None or _above(buffer, frames) <= kept:

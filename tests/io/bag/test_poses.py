@@ -100,8 +100,6 @@ def test_the_only_topic_is_taken_and_of_several_one_must_be_chosen(tmp_path: Pat
 
 @pytest.mark.recorded
 def test_recorded_streams_are_read(gvo_data: Path) -> None:
-    stream, _ = read(gvo_data / "bags/good/pose_streams.bag", "S-PTAM")
-    assert len(stream.poses) == 5439
     odometry, _ = read(gvo_data / "bags/good/nav2_turtlebot.mcap", "/odom")
     assert len(odometry.poses) == 2639
     assert np.isfinite(odometry.covariances).all()

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
@@ -156,6 +156,7 @@ def test_another_reader_finds_the_topics_and_the_stamps(tmp_path: Path, name: st
 
 
 @pytest.mark.parametrize("name", ["a.bag", "a.mcap"])
+@settings(max_examples=8)
 @given(stamps=st.sets(st.integers(0, 2**31 * 10**9 - 1), min_size=1, max_size=5).map(sorted))
 def test_stamps_are_exact_to_the_nanosecond(
     tmp_path_factory: pytest.TempPathFactory, name: str, stamps: list[int]

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from scipy.spatial.transform import Rotation
 
 from gvo.errors import CalibrationError, RecordingError
@@ -77,3 +78,27 @@ def test_a_missing_table_is_refused_and_a_missing_image_is_not(tmp_path: Path, t
     (folder / "mav0/cam1/data.csv").unlink()
     with pytest.raises(RecordingError, match=r"data\.csv: cannot be read: No such file"):
         EurocSource(folder)
+
+
+def test_the_pose_on_the_body_is_that_of_the_rectified_camera(tmp_path: Path, tiny: Any) -> None:
+    folder = _write(tmp_path / "m", tiny)
+    T_body_left, _ = _poses()
+    sensors = [folder / "mav0" / f"cam{n}" / "sensor.yaml" for n in range(2)]
+    (tmp_path / "pair.yaml").write_text(yaml.safe_dump(tiny.ros_pair()))
+    for calibration in (None, sensors, folder, folder / "mav0", tmp_path / "pair.yaml"):
+        info = EurocSource(folder, calibration=calibration).info
+        assert info.T_body_cam is not None
+        R = info.calibrations[0].R
+        np.testing.assert_allclose(info.T_body_cam[:3, :3], T_body_left[:3, :3] @ R.T, atol=1e-12)
+        np.testing.assert_allclose(info.T_body_cam[:3, 3], T_body_left[:3, 3], atol=1e-12)
+    # the file's own pose on its body counts
+    moved = yaml.safe_load(sensors[0].read_text())
+    moved["T_BS"]["data"][3] += 1.0
+    (tmp_path / "0.yaml").write_text(yaml.safe_dump(moved))
+    moved = yaml.safe_load(sensors[1].read_text())
+    moved["T_BS"]["data"][3] += 1.0
+    (tmp_path / "1.yaml").write_text(yaml.safe_dump(moved))
+    info = EurocSource(folder, calibration=[tmp_path / "0.yaml", tmp_path / "1.yaml"]).info
+    assert info.T_body_cam is not None
+    assert info.T_body_cam[0, 3] == pytest.approx(T_body_left[0, 3] + 1.0)
+    assert "rectification: the poses of both on the body of 0.yaml + 1.yaml" in info.decisions

@@ -138,3 +138,10 @@ def test_the_truth_is_read_where_there_is_one(tmp_path: Path, tiny: Any) -> None
     truth = TumSource(folder).ground_truth()
     assert truth is not None
     np.testing.assert_array_equal(truth.positions, [[1, 2, 3]])
+
+
+def test_depth_that_makes_no_sense_at_all_is_doubted(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_tum(tmp_path / "f", _COLOR, _DEPTH)
+    for stamp in _DEPTH:
+        tiny.write_image(folder / "depth" / f"{stamp}.png", tiny.counts(0) // 1000 + 1)
+    assert "implausible" in _depth_decision(TumSource(folder))

@@ -114,27 +114,6 @@ def test_a_malformed_line_says_what_is_wrong(line: str, words: str) -> None:
         parse_line(line)
 
 
-_json_values = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=3),
-    lambda inner: (
-        st.lists(inner, max_size=8)
-        | st.dictionaries(
-            st.sampled_from(["id", "stamp_ns", "reference", "pose", "edges", "prior", "sigmas"]),
-            inner,
-        )
-    ),
-    max_leaves=20,
-)
-
-
-@given(st.text() | _json_values.map(json.dumps) | st.lists(st.floats() | st.integers()).map(str))
-def test_no_line_brings_anything_but_value_error(line: str) -> None:
-    try:
-        parse_line(line.replace("\n", " "))
-    except ValueError as error:
-        assert str(error)  # noqa: PT017 - a reason is told
-
-
 @given(seeds)
 def test_answers_hold_the_estimate_without_loss(seed: int) -> None:
     T, pose, covariance = random_numbers(seed)

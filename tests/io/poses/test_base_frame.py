@@ -119,12 +119,10 @@ def test_an_edge_leads_from_base_to_base(seed: int) -> None:
     assert BaseFrame("cam").apply_to_edge(last.stamp_ns, edge) is edge
 
 
-@pytest.mark.parametrize("is_moving", [False, True])
-def test_the_covariance_is_that_of_sampled_poses(is_moving: bool) -> None:
+def test_the_covariance_is_that_of_sampled_poses() -> None:
     rng = np.random.default_rng(3)
-    buffer, T_base_cam = mounted(rng, STAMPS_NS)
-    mount = on_tf(buffer, "base", "cam")
-    frame = mount if is_moving else BaseFrame("base", T_base_cam[0])
+    buffer, _ = mounted(rng, STAMPS_NS)
+    frame = on_tf(buffer, "base", "cam")
     frame.start(STAMPS_NS[0])
     T, covariance = random_transform(rng), random_covariance(rng, scale=1e-4)
 
@@ -132,13 +130,13 @@ def test_the_covariance_is_that_of_sampled_poses(is_moving: bool) -> None:
         return frame.apply(estimate_at(STAMPS_NS[3], T_world_cam, covariance=covariance))
 
     out = of(T)
-    twists = rng.multivariate_normal(np.zeros(6), covariance, size=4000)
+    twists = rng.multivariate_normal(np.zeros(6), covariance, size=1000)
     poses = np.array([of(T @ se3.exp(xi)).T_world_frame for xi in twists])
     moved = se3.log(np.linalg.inv(out.T_world_frame) @ poses)
     sampled = moved.T @ moved / len(moved)
-    # whitened by the stated covariance it is the identity; its entries scatter by 0.016 to 0.022
+    # whitened by the stated covariance it is the identity; its entries scatter by 0.03 to 0.045
     L_inverse = np.linalg.inv(np.linalg.cholesky(out.covariance))
-    np.testing.assert_allclose(L_inverse @ sampled @ L_inverse.T, np.eye(6), atol=0.1)
+    np.testing.assert_allclose(L_inverse @ sampled @ L_inverse.T, np.eye(6), atol=0.2)
     assert np.array_equal(out.covariance, out.covariance.T)
 
 
