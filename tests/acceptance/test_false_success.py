@@ -73,17 +73,13 @@ def track(held: Held, part: slice = slice(None), *, kind: str = "klt") -> Tracke
     return Tracked(results, held.truth.T_world_frame[part])
 
 
-def test_a_bus_that_fills_two_thirds_of_the_view_does_not_carry_the_camera_along() -> None:
-    tracked = track(rendered("traffic", "stereo", 95, 0.4))
-    assert not list(tracked.wrong_steps())
-    assert tracked.errors_m().max() < 0.3
-
-
 @pytest.mark.parametrize(
     ("kind", "speed", "seed"),
-    [("klt", 0.5, 0), ("klt", 0.5, 1), ("descriptor", 1.0, 0), ("descriptor", 2.0, 0)],
+    [("klt", 1.0, 0), ("klt", 0.5, 1), ("descriptor", 2.0, 0)],
 )
-def test_a_bus_that_pulls_off_does_not_draw_predictions(kind: str, speed: float, seed: int) -> None:
+def test_a_bus_that_fills_the_view_and_pulls_off_does_not_carry_the_camera_along(
+    kind: str, speed: float, seed: int
+) -> None:
     tracked = track(rendered("traffic", "stereo", 95, 0.4, seed=seed, speed=speed), kind=kind)
     assert not list(tracked.wrong_steps())
     assert tracked.errors_m().max() < 0.3
@@ -96,9 +92,8 @@ def test_a_front_that_repeats_exactly_is_not_followed_by_a_window_off() -> None:
     assert tracked.errors_m()[-1] < 0.03 * travelled
 
 
-@pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
-def test_before_a_blank_wall_no_pose_is_called_ok_until_the_room_is_back(sensor: str) -> None:
-    tracked = track(rendered("wall", sensor, 250, 0.3), slice(80, None))
+def test_before_a_blank_wall_no_pose_is_called_ok_until_the_room_is_back() -> None:
+    tracked = track(rendered("wall", "rgbd", 250, 0.3), slice(80, None))
     assert not list(tracked.wrong_steps())
     blank = tracked.results[36:128]
     assert not any(result.status in TIED for result in blank)

@@ -57,10 +57,10 @@ def svg_text(folder: Path, *arguments: object, **options: object) -> str:
 def test_the_meanings_of_the_colours_are_fixed(tmp_path: Path) -> None:
     path = tmp_path / "plot.png"
     names = {"raw": RAW, "causal": CAUSAL, "smoothed": SMOOTHED, "other": FREE}
-    for name, colour in names.items():
-        plot_trajectories(path, curve(0), {name: curve(1)})
-        for rgb in names.values():
-            assert (n_pixels(path, rgb) > 100) == (rgb == colour)
+    for chosen in (["raw", "causal"], ["smoothed", "other"]):
+        plot_trajectories(path, curve(0), {name: curve(k) for k, name in enumerate(chosen)})
+        for name, rgb in names.items():
+            assert (n_pixels(path, rgb) > 100) == (name in chosen)
 
 
 def test_equal_input_gives_equal_files(tmp_path: Path) -> None:
@@ -77,11 +77,9 @@ def test_equal_input_gives_equal_files(tmp_path: Path) -> None:
     ("extents", "start", "axes"),
     [
         # the world of a camera, whatever it did
-        ((3.0, 9.0, 5.0), 0.0, "xz"),
         ((3.0, 9.0, 5.0), 1.0, "xz"),
         # any other has z up, whatever was done in it
         ((3.0, 5.0, 0.2), 1.0, "xy"),
-        ((0.2, 5.0, 3.0), 1.0, "xy"),
         ((3.0, 0.2, 5.0), 1.0, "xy"),
     ],
 )

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from gvo.config import Config
-from gvo.diagnostics.explain.values import Corner, Sorting
+from gvo.diagnostics.explain.values import Corner, Registration, Sorting
 from gvo.frontend.calibration import RigOffsets
 from gvo.frontend.features import FeatureExtractor
 from gvo.frontend.klt import image_of
@@ -132,45 +132,37 @@ def as_mask(indices: IntArray, n: int) -> BoolArray:
     return mask
 
 
-def explain_disparity(
-    frame: StereoFrame, camera: StereoCamera, measured: Sorting, config: Config
+def explain_corner(
+    frame: Frame,
+    reference: Frame | None,
+    measured: Sorting,
+    found: Registration | None,
+    camera: StereoCamera,
+    *,
+    min_depth_m: float,
 ) -> Corner | None:
-    """Follow one corner of those kept along its row in the right image."""
-    images = frame.left, frame.right
-    ends = measured.pixels[measured.are_kept], measured.partners[measured.are_kept]
-    index = _typical(images[0], ends[0], PATCH_RADIUS_PX)
+    """Follow one corner: along its row in the right image, or from the reference to the frame."""
+    if isinstance(frame, StereoFrame):
+        images, radius = (frame.left, frame.right), PATCH_RADIUS_PX
+        sorting, kept = measured, np.flatnonzero(measured.are_kept)
+    elif reference is None or found is None:
+        return None
+    else:
+        images, radius = (image_of(reference), image_of(frame)), WINDOW_RADIUS_PX
+        sorting, kept = found.matches, np.flatnonzero(found.matches.are_kept)[found.inliers]
+    index = _typical(images[0], sorting.pixels[kept], radius)
     if index is None:
         return None
-    pixel, partner = ends[0][index], ends[1][index]
-    highest = min(float(camera.depth_to_disparity(config.stereo.min_depth_m)), pixel[0])
-    # From left to right in the image: from the largest disparity to the smallest.
-    disparities = np.arange(0.0, highest + 1.0)[::-1]
-    columns = disparities, pixel[0] - disparities
-    return _follow(images, pixel, partner, columns=columns, radius=PATCH_RADIUS_PX)
-
-
-def explain_track(
-    frames: tuple[Frame, Frame], matches: Sorting, inliers: BoolArray
-) -> Corner | None:
-    """Follow one point from the reference into the current image."""
-    images = image_of(frames[0]), image_of(frames[1])
-    kept = np.flatnonzero(matches.are_kept)[inliers]
-    index = _typical(images[0], matches.pixels[kept], WINDOW_RADIUS_PX)
-    if index is None:
-        return None
-    pixel, partner = matches.pixels[kept][index], matches.partners[kept][index]
-    steps = np.arange(-_REACH_PX, _REACH_PX + 1.0)
-    columns = steps, partner[0] + steps
-    return _follow(images, pixel, partner, columns=columns, radius=WINDOW_RADIUS_PX)
-
-
-def _typical(image: ImageArray, pixels: FloatArray, radius: int) -> int | None:
-    """Return the pixel whose patch determines its column better than half of the others."""
-    patches = [_patch(image, pixel, radius) for pixel in pixels]
-    gradients = [float(np.sum(np.diff(patch, axis=1) ** 2)) for patch in patches]
-    if not gradients:
-        return None
-    return int(np.argsort(gradients, kind="stable")[len(gradients) // 2])
+    pixel, partner = sorting.pixels[kept][index], sorting.partners[kept][index]
+    if isinstance(frame, StereoFrame):
+        # From left to right in the image: from the largest disparity to the smallest.
+        highest = min(float(camera.depth_to_disparity(min_depth_m)), pixel[0])
+        names = np.arange(0.0, highest + 1.0)[::-1]
+        places = pixel[0] - names
+    else:
+        names = np.arange(-_REACH_PX, _REACH_PX + 1.0)
+        places = partner[0] + names
+    return _follow(images, pixel, partner, names=names, places=places, radius=radius)
 
 
 def _follow(
@@ -178,12 +170,12 @@ def _follow(
     pixel: FloatArray,
     partner: FloatArray,
     *,
-    columns: tuple[FloatArray, FloatArray],
+    names: FloatArray,
+    places: FloatArray,
     radius: int,
 ) -> Corner:
-    """Correlate a patch with the row of its partner; `columns`: their names, and pixels."""
+    """Correlate a patch with the row of its partner, at places along it with their names."""
     first = _patch(images[0], pixel, radius)
-    names, places = columns
     middle = (0.5 * (places[0] + places[-1]), partner[1])
     size = (len(places) + 2 * radius, 2 * radius + 1)
     strip = cv2.getRectSubPix(images[1], size, middle, patchType=cv2.CV_32F)
@@ -196,6 +188,15 @@ def _follow(
         correlations=found.astype(np.float64),
         end=float(np.interp(partner[0], places, names)),
     )
+
+
+def _typical(image: ImageArray, pixels: FloatArray, radius: int) -> int | None:
+    """Return the pixel whose patch determines its column better than half of the others."""
+    patches = [_patch(image, pixel, radius) for pixel in pixels]
+    gradients = [float(np.sum(np.diff(patch, axis=1) ** 2)) for patch in patches]
+    if not gradients:
+        return None
+    return int(np.argsort(gradients, kind="stable")[len(gradients) // 2])
 
 
 def _patch(image: ImageArray, pixel: FloatArray, radius: int) -> FloatArray:

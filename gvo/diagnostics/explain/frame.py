@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from gvo.config import Config
-from gvo.diagnostics.explain.extraction import explain_disparity, explain_measured, explain_track
+from gvo.diagnostics.explain.extraction import explain_corner, explain_measured
 from gvo.diagnostics.explain.motion import Asked, OwnFrontend, explain_registration
-from gvo.diagnostics.explain.values import Corner, FrameExplanation, Link, Registration, Sorting
+from gvo.diagnostics.explain.values import FrameExplanation, Link
 from gvo.errors import RecordingError
 from gvo.frontend.descriptor import is_step
 from gvo.frontend.factory import make_frontend
@@ -28,7 +28,6 @@ from gvo.types import (
     Progress,
     RelativePose,
     Status,
-    StereoFrame,
 )
 
 
@@ -156,6 +155,11 @@ class _Drive:
         reference_ns = steps[-1].reference.stamp_ns if steps else None
         reference = None if reference_ns is None else before[reference_ns]
         registration = explain_registration(own, steps[-1], config) if steps else None
+        corner = None
+        if isinstance(own, KltFrontend):
+            near_m = config.stereo.min_depth_m
+            seen = frame, reference, measured, registration, own.camera
+            corner = explain_corner(*seen, min_depth_m=near_m)
         return FrameExplanation(
             recording=self._name,
             index=index,
@@ -169,26 +173,10 @@ class _Drive:
             row_offset_px=offsets.row.value,
             readout_ms=1e3 * offsets.readout_s,
             measured=measured,
-            corner=self._corner(frame, reference, measured, registration),
+            corner=corner,
             registration=registration,
             links=links,
         )
-
-    def _corner(
-        self,
-        frame: Frame,
-        reference: Frame | None,
-        measured: Sorting,
-        registration: Registration | None,
-    ) -> Corner | None:
-        own = self._frontend.own
-        if not isinstance(own, KltFrontend):
-            return None
-        if isinstance(frame, StereoFrame):
-            return explain_disparity(frame, own.camera, measured, self._config)
-        if reference is None or registration is None:
-            return None
-        return explain_track((reference, frame), registration.matches, registration.inliers)
 
     def _links(
         self, asked: list[Asked], result: FrameResult, frames: dict[int, Frame]

@@ -236,5 +236,7 @@ def _pieces(points: FloatArray, n_decimals: int) -> list[list[list[float]]]:
 
 def legend_of(lines: Sequence[Line]) -> list[tuple[str, str, str]]:
     """Return name, colour and dashes of each line, as the page's legend takes them."""
-    dashes = {"-": "", "--": "6 4", "-.": "6 3 1 3", ":": "2 3"}
-    return [(line.name, line.style.color, dashes[line.style.linestyle]) for line in lines]
+    return [
+        (line.name, line.style.color, " ".join(map(str, _DASHES[line.style.linestyle])))
+        for line in lines
+    ]

@@ -57,15 +57,6 @@ def test_the_table_has_a_line_per_finding_and_aligned_columns(result: CheckResul
         assert row.endswith(finding.fix)
 
 
-@given(st.floats(-10, 10), st.floats(-1, 1), st.floats(2, 3))
-def test_farther_out_is_never_judged_milder(value: float, limit: float, fault: float) -> None:
-    rule = Rule(low=-limit, high=limit + 1, fault_low=-fault, fault_high=fault)
-    ranks = {"ok": 0, "warning": 1, "fault": 2}
-    outward = 1.5 * value if abs(value) > fault else math.copysign(fault + 1, value)
-    assert ranks[rule.judge(outward)] >= ranks[rule.judge(value)]
-    assert ranks[rule.judge(outward)] == 2
-
-
 def test_the_limits_themselves_are_still_within() -> None:
     rule = Rule(low=1.0, high=2.0, fault_high=3.0, unit="m")
     assert [rule.judge(value) for value in (1.0, 2.0, 2.1, 3.0, 3.1, 0.9, math.nan)] == [
@@ -99,9 +90,7 @@ def test_warnings_alone_do_not_make_a_recording_unusable() -> None:
     ("second", "n_rows"),
     [
         ({"name": "right: rows", "value": "4"}, 1),
-        ({"name": "right: rows"}, 1),
         ({"name": "right: rows", "verdict": "warning", "fix": "do"}, 2),
-        ({"name": "right: rows", "threshold": "<= 6"}, 2),
         ({"name": "right: columns"}, 2),
     ],
 )
