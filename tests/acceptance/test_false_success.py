@@ -77,7 +77,7 @@ def track(held: Held, part: slice = slice(None), *, kind: str = "klt") -> Tracke
     ("kind", "speed", "seed"),
     [("klt", 1.0, 0), ("klt", 0.5, 1), ("descriptor", 2.0, 0)],
 )
-def test_a_bus_that_fills_the_view_and_pulls_off_does_not_carry_the_camera_along(
+def test_a_bus_that_fills_the_view_does_not_carry_the_camera_along(
     kind: str, speed: float, seed: int
 ) -> None:
     tracked = track(rendered("traffic", "stereo", 95, 0.4, seed=seed, speed=speed), kind=kind)
