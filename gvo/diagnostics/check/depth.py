@@ -69,26 +69,25 @@ def estimate_misregistration(frames: Sequence[RgbdFrame]) -> Misregistration | F
     both are estimated together. Depth of another focal length (not registered at all) shows as a
     zoom, common to both axes.
     """
-    axes = [_collect(frames, axis) for axis in (1, 0)]
-    has_enough = [min(len(each.offsets) for each in pair) >= _MIN_POINTS for pair in axes]
-    if not any(has_enough):
-        return Failure(reason="too few steps of depth")
-    scores = {
-        zoom: [
-            _score(pair, zoom) if ok else None for pair, ok in zip(axes, has_enough, strict=True)
-        ]
-        for zoom in _ZOOMS
+    pairs = {letter: _collect(frames, axis) for letter, axis in (("u", 1), ("v", 0))}
+    known = {
+        letter: pair
+        for letter, pair in pairs.items()
+        if min(len(each.offsets) for each in pair) >= _MIN_POINTS
     }
+    if not known:
+        return Failure(reason="too few steps of depth")
     contrasts = {
-        zoom: float(np.mean([score.max() - 1.0 for score in found if score is not None]))
-        for zoom, found in scores.items()
+        zoom: float(np.mean([_score(pair, zoom).max() - 1.0 for pair in known.values()]))
+        for zoom in _ZOOMS
     }
     zoom = max(_ZOOMS, key=contrasts.__getitem__)
     if contrasts[zoom] < _MIN_ZOOM_GAIN * contrasts[0.0]:
         zoom = 0.0
     if contrasts[zoom] < _MIN_CONTRAST:
         return Failure(reason="edges of depth and colour do not meet anywhere")
-    u, v = (math.nan if score is None else _peak(score) for score in scores[zoom])
+    peaks = {letter: _peak(_score(pair, zoom)) for letter, pair in known.items()}
+    u, v = (peaks.get(letter, math.nan) for letter in "uv")
     if math.isnan(u) and math.isnan(v):
         return Failure(reason="the two sides of things disagree about the offset")
     height, width = frames[0].depth.shape
@@ -201,11 +200,9 @@ def check_depth(samples: Sequence[Sample], config: Config) -> Iterator[Finding]:
         return
     yield from _check_values([frame.depth for frame in frames], config)
     yield _check_corners(frames, config)
-    pairs = [
-        (sample.first.depth, sample.second.depth)
-        for sample in samples
-        if isinstance(sample.first, RgbdFrame) and isinstance(sample.second, RgbdFrame)
-    ]
+    seconds = [sample.second for sample in samples if isinstance(sample.first, RgbdFrame)]
+    depths = zip(frames, seconds, strict=True)
+    pairs = [(one.depth, other.depth) for one, other in depths if isinstance(other, RgbdFrame)]
     if pairs:
         yield check_frozen("depth", pairs)
     yield _check_registration(frames)
@@ -214,22 +211,16 @@ def check_depth(samples: Sequence[Sample], config: Config) -> Iterator[Finding]:
 def _check_values(depths: Sequence[DepthArray], config: Config) -> Iterator[Finding]:
     """Yield the findings on the depth values: medians over the images."""
     known = [depth[np.isfinite(depth)] for depth in depths]
-    median_m = _typical([float(np.nanmedian(depth)) for depth in depths])
+    median_m = float(np.median([np.median(each) for each in known]))
     yield measured("depth: scale", median_m, text=f"median {median_m:.3g} m")
     low, high = config.depth.min_depth_m, config.depth.max_depth_m
-    share = _typical([float(np.mean((each >= low) & (each <= high))) for each in known])
+    share = float(np.median([np.mean((each >= low) & (each <= high)) for each in known]))
     text = f"{share:.1%} of the known depth within {low:g} .. {high:g} m"
     yield measured("depth: within limits", share, text=text)
-    share = _typical(
-        [1.0 - len(each) / depth.size for each, depth in zip(known, depths, strict=True)]
-    )
+    share = 1.0 - float(np.median([np.mean(np.isfinite(depth)) for depth in depths]))
     yield measured("depth: unknown", share, text=f"{share:.1%} of the pixels")
-    n_levels = _typical([len(np.unique(each)) for each in known])
+    n_levels = float(np.median([len(np.unique(each)) for each in known]))
     yield measured("depth: levels", n_levels, text=f"{n_levels:.0f} per image")
-
-
-def _typical(values: Sequence[float]) -> float:
-    return float(np.median(values))
 
 
 def _check_corners(frames: Sequence[RgbdFrame], config: Config) -> Finding:
@@ -237,13 +228,10 @@ def _check_corners(frames: Sequence[RgbdFrame], config: Config) -> Finding:
     counts = []
     for frame in frames:
         corners = detect_corners(frame.image, config.klt.n_corners)
-        counts.append(int(np.count_nonzero(sample_depth(frame.depth, corners, config.depth)[1])))
-    return measured(
-        "depth: corners with depth",
-        _typical(counts),
-        fault_low=config.ransac.min_inliers,
-        text=f"{_typical(counts):.0f} per frame (median)",
-    )
+        counts.append(np.count_nonzero(sample_depth(frame.depth, corners, config.depth)[1]))
+    typical, fewest = float(np.median(counts)), config.ransac.min_inliers
+    text = f"{typical:.0f} per frame (median)"
+    return measured("depth: corners with depth", typical, fault_low=fewest, text=text)
 
 
 def _check_registration(frames: Sequence[RgbdFrame]) -> Finding:
