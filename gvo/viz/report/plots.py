@@ -87,12 +87,18 @@ def error_plots(comparisons: Sequence[Comparison], align: AlignMode) -> list[Plo
         if any(c.errors_rad is not None for c in comparisons)
         else "The ground truth holds no rotations: there are no rotation errors."
     )
+    first_ns = min(int(c.reference.stamps_ns[0]) for c in comparisons)
+    is_by_row = any(c.reference.stamps_from == "rows" for c in comparisons)
     return [
         _plot(
             "errors_over_time",
             text=f"Position errors {_ALIGNED[align]}. {rotations} "
             "Good curves are low and smooth; a step is a single bad frame.",
-            figure=_curves_over_time(comparisons),
+            figure=_curves(
+                comparisons,
+                lambda c: elapsed(c.reference.stamps_ns, first_ns),
+                "row" if is_by_row else "elapsed [s]",
+            ),
         ),
         _plot(
             "errors_over_distance",
@@ -103,13 +109,6 @@ def error_plots(comparisons: Sequence[Comparison], align: AlignMode) -> list[Plo
             ),
         ),
     ]
-
-
-def _curves_over_time(comparisons: Sequence[Comparison]) -> Figure:
-    first_ns = min(int(c.reference.stamps_ns[0]) for c in comparisons)
-    is_by_row = any(c.reference.stamps_from == "rows" for c in comparisons)
-    label = "row" if is_by_row else "elapsed [s]"
-    return _curves(comparisons, lambda c: elapsed(c.reference.stamps_ns, first_ns), label)
 
 
 def _curves(
@@ -199,9 +198,12 @@ def _bands(item: Consistency, first_ns: int) -> Figure:
     figure = new_figure(5.2)
     panels: Any = figure.subplots(2, 3, sharex=True)
     x = elapsed(item.end_ns, first_ns)
+    is_many = len(x) > MANY
+    band: dict[str, Any] = {"alpha": 0.2, "lw": 0, "rasterized": is_many, "label": "\u00b13 sigma"}
     for panel, (index, letter, unit) in zip(panels.flat, _PANELS, strict=True):
         factor = 1.0 if unit == "m" else float(np.rad2deg(1.0))
-        _draw_band(panel, x, _SIGMAS * factor * item.sigmas[:, index])
+        reach = _SIGMAS * factor * item.sigmas[:, index]
+        panel.fill_between(x, -reach, reach, color=_RAW.color, **band)
         y = factor * item.errors[:, index]
         draw_curve(panel, x, y, _RAW, label=item.name)
         kind = "position" if unit == "m" else "rotation"
@@ -210,16 +212,6 @@ def _bands(item: Consistency, first_ns: int) -> Figure:
         panel.set_xlabel("elapsed [s]")
     legend_above(figure, panels[0, 0])
     return figure
-
-
-def _draw_band(axes: Any, x: FloatArray, reach: FloatArray) -> None:  # noqa: ANN401
-    label = "\u00b13 sigma"
-    if len(x) == 1:  # a band of one pose has no area
-        axes.plot([x[0], x[0]], [-reach[0], reach[0]], color=_RAW.color, marker="_", label=label)
-    else:
-        is_many = len(x) > MANY
-        looks: dict[str, Any] = {"alpha": 0.2, "lw": 0, "label": label, "rasterized": is_many}
-        axes.fill_between(x, -reach, reach, color=_RAW.color, **looks)
 
 
 def status_plot(frames: Table) -> Plot:
@@ -335,8 +327,6 @@ def timing_plot(timings: Table) -> Plot:
 
 def _stack(axes: Axes, timings: Table, table: FloatArray) -> None:
     x = elapsed(timings["stamp_ns"], int(timings["stamp_ns"][0]))
-    if len(x) == 1:  # a stack of one frame has no width
-        x, table = np.array([-0.5, 0.5]), np.repeat(table, 2, axis=1)
     stages = [name.removesuffix("_ms") for name in timings if name.endswith("_ms")]
     labels = [f"{name} ({np.median(row):.1f})" for name, row in zip(stages, table, strict=True)]
     colours = [palette.STAGES.get(name, _UNKNOWN) for name in stages]
@@ -431,7 +421,19 @@ def _histogram(edges: Table, bound: float) -> Figure:
     axes: Any = figure.subplots()
     is_free = _is_free(edges)
     for kind in palette.LINKS:
-        _draw_bars(axes, kind, edges["chi2"][is_free & (edges["kind"] == kind)])
+        values = edges["chi2"][is_free & (edges["kind"] == kind)]
+        if len(values) > 0:
+            looks: dict[str, Any] = {"facecolor": palette.LINKS[kind], "hatch": _HATCHES[kind]}
+            axes.hist(
+                np.clip(np.log10(np.maximum(values, 1e-300)), *_DECADES),
+                np.linspace(*_DECADES, _N_BINS + 1),
+                density=True,
+                histtype="stepfilled",
+                edgecolor="black",
+                alpha=0.5,
+                label=f"{kind} ({len(values)})",
+                **looks,
+            )
     grid = np.linspace(*_DECADES, 400)
     # density over the decimal logarithm
     density = chi2_density(10.0**grid) * 10.0**grid * np.log(10.0)
@@ -443,19 +445,3 @@ def _histogram(edges: Table, bound: float) -> Figure:
     axes.set(xlim=_DECADES, ylim=(0.0, None))
     legend_above(figure, axes)
     return figure
-
-
-def _draw_bars(axes: Any, kind: str, values: FloatArray) -> None:  # noqa: ANN401
-    if len(values) == 0:
-        return
-    axes.hist(
-        np.clip(np.log10(np.maximum(values, 1e-300)), *_DECADES),
-        np.linspace(*_DECADES, _N_BINS + 1),
-        density=True,
-        histtype="stepfilled",
-        facecolor=palette.LINKS[kind],
-        edgecolor="black",
-        alpha=0.5,
-        hatch=_HATCHES[kind],
-        label=f"{kind} ({len(values)})",
-    )
