@@ -20,6 +20,7 @@ _HEADERS = ("message_filters/sync_policies/approximate_time.h", "ros/message_eve
 _IS_THERE = which("g++") and all((Path("/usr/include") / name).exists() for name in _HEADERS)
 
 pytestmark = [
+    pytest.mark.acceptance,  # the compiler alone takes many seconds
     pytest.mark.ros1,
     pytest.mark.skipif(
         not _IS_THERE, reason="needs g++ and message_filters of ROS 1 (libmessage-filters-dev)"
@@ -118,7 +119,7 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Reference]:
     folder = tmp_path_factory.mktemp("message_filters")
     (folder / "pairs.cpp").write_text(_PROGRAM)
     libraries = [f"-l{name}" for name in _LIBRARIES]
-    command = ["g++", "-O1", "-w", "-std=c++17", "pairs.cpp", "-o", "pairs", *libraries]
+    command = ["g++", "-O0", "-w", "-std=c++17", "pairs.cpp", "-o", "pairs", *libraries]
     subprocess.run(command, cwd=folder, check=True)
     with subprocess.Popen(
         [folder / "pairs"],
