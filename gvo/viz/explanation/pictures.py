@@ -19,7 +19,6 @@ from gvo.frontend.klt import image_of
 from gvo.types import FloatArray, RelativePose, RgbdFrame, StereoFrame
 from gvo.viz.figures import (
     Plot,
-    count_words,
     draw_segments,
     image_height,
     is_wide,
@@ -59,13 +58,14 @@ def draw_pictures(explanation: FrameExplanation) -> list[Plot]:
     ]
 
 
-def _picture(slug: str, text: str, figure: Figure | None = None) -> Plot:
+def _picture(slug: str, figure: Figure | None, text: str = "") -> Plot:
+    """Return a picture, whose words are those of the page, or the reason why there is none."""
     return Plot(slug=slug, title=TITLES[slug], text=text, figure=figure, is_image=True)
 
 
 def _not_reached(slug: str, explanation: FrameExplanation) -> Plot:
     why = explanation.result.reason or "this is the first frame, there is none to compare with"
-    return _picture(slug, f"Not reached: {why}.")
+    return _picture(slug, None, f"Not reached: {why}.")
 
 
 def _draw_measured(explanation: FrameExplanation) -> Plot:
@@ -100,23 +100,11 @@ def _draw_disparities(explanation: FrameExplanation, frame: StereoFrame) -> Plot
         show_image(axes, frame.left, "corners without a match, by the first test that they failed")
         _draw_reasons(axes, measured)
         legend_below(figure, axes)
-    config, camera = explanation.config.stereo, explanation.camera
-    low, high = (camera.depth_to_disparity(z) for z in (config.max_depth_m, config.min_depth_m))
-    how = "Corners are searched along their rows by correlation; left and right must look alike."
-    if not explanation.is_klt:
-        how = "Descriptors are compared along the rows; each of a match is the best of the other."
-    words = (
-        f"Of {len(kept)} keypoints: {count_words(measured.counts())}. {how} The depth limits of "
-        f"{config.max_depth_m:g} and {config.min_depth_m:g} m are disparities of {low:.1f} and "
-        f"{high:.1f} px. Learnt of the rig before this frame: disparities are off by "
-        f"{explanation.offset_px:+z.3f} px, rows of the right image by "
-        f"{explanation.row_offset_px:+z.3f} px."
-    )
-    return _picture("1_measured", words, figure)
+    return _picture("1_measured", figure)
 
 
 def _draw_depths(explanation: FrameExplanation, frame: RgbdFrame) -> Plot:
-    measured, config = explanation.measured, explanation.config.depth
+    measured = explanation.measured
     figure = new_figure(image_height(frame.depth.shape, share=0.5) + 0.7)
     first, second = figure.subplots(1, 2)
     finite = frame.depth[np.isfinite(frame.depth)]
@@ -131,13 +119,7 @@ def _draw_depths(explanation: FrameExplanation, frame: RgbdFrame) -> Plot:
     second.plot(*kept.T, "o", color=INLIERS, markersize=4.0, mfc="none", label=label)
     _draw_reasons(second, measured)
     legend_below(figure, second)
-    words = (
-        f"Of {len(measured.pixels)} keypoints: {count_words(measured.counts())}. Valid depth lies "
-        f"between {config.min_depth_m:g} and {config.max_depth_m:g} m and varies by at most "
-        f"{100 * config.max_edge_step:g} % within {config.edge_radius_px} px (depth.max_edge_step):"
-        " at an edge, a shift of a pixel between colour and depth moves a point by far."
-    )
-    return _picture("1_measured", words, figure)
+    return _picture("1_measured", figure)
 
 
 def _draw_reasons(axes: Axes, sorting: Sorting, pixels: FloatArray | None = None) -> None:
@@ -178,43 +160,13 @@ def _draw_flow(explanation: FrameExplanation) -> Plot:
         draw_segments(axes, starts, ends + shift, colors=INLIERS, linewidths=0.7)
         axes.plot(*starts.T, ".", color=INLIERS, markersize=4, label=f"matched: {len(ends)}")
     legend_below(figure, axes)
-    return _picture("2_flow", _flow_words(explanation, registration), figure)
-
-
-def _flow_words(explanation: FrameExplanation, registration: Registration) -> str:
-    matches, radius = registration.matches, registration.radius_px
-    place = "predicted" if registration.is_predicted else "previous"
-    how = f"Descriptors are compared within {radius:g} px of the {place} pixels."
-    if explanation.is_klt:
-        side = 2 * radius + 1
-        how = f"Windows of {side:g} x {side:g} px are tracked from the {place} pixels."
-    text = (
-        f"Of {len(matches.pixels)} points of frame {explanation.reference_index}, the reference: "
-        f"{count_words(matches.counts())}. {how}"
-    )
-    kept = matches.are_kept
-    if kept.any():
-        flow, error = (
-            np.linalg.norm(matches.partners[kept] - each[kept], axis=1)
-            for each in (matches.pixels, matches.predicted)
-        )
-        text += (
-            f" Points move by {np.median(flow):.1f} px (median, at most {flow.max():.1f}); they "
-            f"are {np.median(error):.1f} px (median, at most {error.max():.1f}) from where they "
-            "were expected."
-        )
-    if explanation.readout_ms:
-        text += (
-            f" For a readout of {explanation.readout_ms:.1f} ms they are moved by at most "
-            f"{registration.row_motion_px:.2f} px to the middle of the exposure."
-        )
-    return text
+    return _picture("2_flow", figure)
 
 
 def _draw_corner(explanation: FrameExplanation) -> Plot:
     corner = explanation.corner
     if corner is None:
-        return _picture("3_corner", "Not reached: no corner was kept.")
+        return _picture("3_corner", None, "Not reached: no corner was kept.")
     is_stereo = isinstance(explanation.frame, StereoFrame)
     names = ("left", "right") if is_stereo else ("reference", "current image")
     figure = new_figure(2.9)
@@ -231,22 +183,7 @@ def _draw_corner(explanation: FrameExplanation) -> Plot:
     curve.set(xlabel=what, ylabel="correlation along the row", ylim=(-1.05, 1.05))
     if is_stereo:
         curve.invert_xaxis()
-    (u, v), size = corner.pixel, len(corner.patches[0])
-    words = (
-        f"The corner at ({u:.0f}, {v:.0f}), of the median gradient: its patch of {size} x {size} "
-        "px in both images, their difference, and the correlation of the first along the row of "
-        "the second. "
-    )
-    if is_stereo:
-        depth_m = explanation.camera.disparity_to_depth(corner.end - explanation.offset_px)
-        words += (
-            f"The search ends at {corner.end:.3f} px, the dashed line: a depth of {depth_m:.2f} m. "
-            "A second peak as high means that the row repeats."
-        )
-    else:
-        u, v = corner.partner
-        words += f"The track ends at ({u:.2f}, {v:.2f}), the dashed line."
-    return _picture("3_corner", words, figure)
+    return _picture("3_corner", figure)
 
 
 def _draw_candidates(explanation: FrameExplanation) -> Plot:
@@ -265,16 +202,14 @@ def _draw_candidates(explanation: FrameExplanation) -> Plot:
     share = 1.0 if is_wide(image.shape) else 0.5
     figure = new_figure(n_rows * (image_height(image.shape, share=share) + 0.6))
     parts = np.asarray(figure.subfigures(n_rows, n_columns, squeeze=False)).ravel()
-    words, n_legend = [], 3 if n_columns == 1 else 2
+    n_legend = 3 if n_columns == 1 else 2
     for part, (where, background, sorting) in zip(parts, shown, strict=True):
         axes = part.subplots()
         show_image(axes, background, f"without a match {where}")
         _draw_reasons(axes, sorting)
         if axes.get_legend_handles_labels()[1]:
             part.legend(loc="outside lower center", ncols=n_legend, frameon=False)
-        words.append(f"{where}: {count_words(sorting.counts())}")
-    text = "Keypoints without a match, by the first test that all their candidates failed. "
-    return _picture("3_candidates", f"{text}{'; '.join(words).capitalize()}.", figure)
+    return _picture("3_candidates", figure)
 
 
 def _draw_consensus(explanation: FrameExplanation) -> Plot:
@@ -302,7 +237,7 @@ def _draw_consensus(explanation: FrameExplanation) -> Plot:
     for part in lower:
         gate = explanation.config.registration.gate
         _draw_residuals(part.subplots(1, 4), registration, gate)
-    return _picture("4_consensus", _consensus_words(explanation, registration), figure)
+    return _picture("4_consensus", figure)
 
 
 def _draw_residuals(panels: Any, registration: Registration, gate: float) -> None:  # noqa: ANN401
@@ -331,31 +266,10 @@ def _compare(axes: Axes, values: FloatArray, bins: FloatArray) -> None:
         axes.hist(shown, bins.tolist(), histtype="stepfilled", alpha=0.6, color=colour, label=name)
 
 
-def _consensus_words(explanation: FrameExplanation, registration: Registration) -> str:
-    inliers, ransac = registration.inliers, explanation.config.ransac
-    limit = f"{ransac.inlier_threshold_px:g} px in (u, v, disparity)"
-    if ransac.inlier_metric == "distance":
-        limit = f"{ransac.inlier_threshold_m:g} m"
-    text = f"A match agrees with a motion if its error is less than {limit}. "
-    n = registration.n_consensus
-    if registration.is_known:
-        text += f"{n} of {len(inliers)} agree with the prediction: RANSAC was not needed. "
-    elif n:
-        text += f"RANSAC found a motion with which {n} agree. "
-    if registration.whitened is None:
-        return f"{text}No motion was accepted: {explanation.result.reason}."
-    rms = float(np.sqrt(np.nanmean(registration.whitened[1][inliers] ** 2)))
-    return (
-        f"{text}Below: measured less predicted, before the refinement and after it; {inliers.sum()}"
-        f" inliers are left. In sigmas their root mean square is {rms:.2f}: 1 where the stated "
-        "noise is right."
-    )
-
-
 def _draw_links(explanation: FrameExplanation) -> Plot:
     links = explanation.links
     if not links:
-        return _picture("5_links", "None: there is no earlier frame to link to.")
+        return _picture("5_links", None, "None: there is no earlier frame to link to.")
     n_columns = min(_N_COLUMNS, max(len(links), 3))
     n_rows = -(-len(links) // n_columns)
     height = n_rows * (image_height(explanation.image.shape, share=1.0 / n_columns) + 0.4)
@@ -365,7 +279,7 @@ def _draw_links(explanation: FrameExplanation) -> Plot:
         _draw_link(axes, link)
     for axes in panels[len(links) :]:
         axes.set_axis_off()
-    return _picture("5_links", _link_words(explanation), figure)
+    return _picture("5_links", figure)
 
 
 def _draw_link(axes: Axes, link: Link) -> None:
@@ -385,22 +299,6 @@ def _draw_link(axes: Axes, link: Link) -> None:
     axes.set_title("\n".join([head, *textwrap.wrap(answer, 48)]), fontsize=8, loc="left")
 
 
-def _link_words(explanation: FrameExplanation) -> str:
-    window, links = explanation.config.window, explanation.links
-    text = (
-        f"Edges to earlier frames (blue): {sum(link.is_accepted for link in links)}; at most "
-        f"{window.n_links} keyframes are registered (window.n_links). Overlap is the share of its "
-        f"points in view; below {window.min_overlap:g} a keyframe is not linked "
-        f"(window.min_overlap), and where all are below {window.keyframe_overlap:g} the frame "
-        "becomes a keyframe itself (window.keyframe_overlap), as this one "
-        f"{'did' if explanation.became_keyframe else 'did not'}. Chi2 is the squared residual of "
-        "the edge over its covariance: about 6 where that is right."
-    )
-    if any(link.kind == "depth" and link.is_accepted for link in explanation.result.links):
-        text += " Depth alone gave another edge to the predecessor (depth.icp)."
-    return text
-
-
 def _draw_times(explanation: FrameExplanation) -> Plot:
     stages = explanation.result.stage_ms
     figure = new_figure(0.9 + 0.28 * len(stages))
@@ -411,8 +309,4 @@ def _draw_times(explanation: FrameExplanation) -> Plot:
     axes.invert_yaxis()
     axes.set_xlabel("wall time [ms]")
     axes.margins(x=0.1)
-    text = (
-        f"The stages of this frame took {sum(stages.values()):.1f} ms. The first frames of a "
-        "process take longer than others."
-    )
-    return _picture("6_times", text, figure)
+    return _picture("6_times", figure)

@@ -13,7 +13,7 @@ from gvo.diagnostics.explain.values import FrameExplanation, Link, Registration,
 from gvo.errors import ConfigurationError, write_faults
 from gvo.types import ConstantError, FloatArray, StereoFrame
 from gvo.viz.explanation.pictures import TITLES, draw_pictures
-from gvo.viz.figures import style
+from gvo.viz.figures import count_words, style
 from gvo.viz.pages import write_page
 
 _RELATIVE = (
@@ -60,24 +60,30 @@ def write_explanation(explanation: FrameExplanation, out: Path) -> list[Path]:
             page,
             "explanation.html",
             title=f"{explanation.recording}: frame {explanation.index}",
-            summary=_summary(explanation),
+            e=explanation,
+            is_stereo=isinstance(explanation.frame, StereoFrame),
             attempts=[] if found is None else found.attempts,
             plots=pictures,
             poses=_poses(explanation),
+            count_words=count_words,
+            median=np.median,
+            **_lengths(found),
         )
     return [*files, page]
 
 
-def _summary(explanation: FrameExplanation) -> str:
-    """Return the result of the frame in words."""
-    result = explanation.result
-    text = (
-        f"Stamp {result.stamp_ns} ns, front-end {explanation.config.frontend.kind}, status "
-        f"{result.status.value}. {result.n_keypoints} keypoints, {result.n_points} of them "
-        f"measured in 3-D; {result.n_matches} matches, {result.n_inliers} inliers; "
-        f"edges in the window: {result.n_links}."
+def _lengths(found: Registration | None) -> dict[str, Any]:
+    """Return by how far matches moved and were off, pixels, and the rms of their residuals."""
+    if found is None:
+        return {"flow_px": (), "error_px": (), "rms": None}
+    matches, kept = found.matches, found.matches.are_kept
+    flow_px, error_px = (
+        np.linalg.norm(matches.partners[kept] - each[kept], axis=1)
+        for each in (matches.pixels, matches.predicted)
     )
-    return f"{text} Not registered: {result.reason}." if result.reason else text
+    left = None if found.whitened is None else found.whitened[1][found.inliers]
+    rms = None if left is None else float(np.sqrt(np.nanmean(left**2)))
+    return {"flow_px": flow_px, "error_px": error_px, "rms": rms}
 
 
 def _poses(explanation: FrameExplanation) -> dict[str, str]:
