@@ -6,7 +6,7 @@ import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -85,7 +85,9 @@ class Plot:
         Id of its section, and stem of its file names.
     title : str
     text : str
-        What it shows and how a good one looks; without a figure, the reason.
+        What it shows, or the reason why there is no figure; empty where `pages/plots.html` says it.
+    facts : mapping of str to object
+        Numbers for the words there.
     figure : Figure or None
     is_half : bool
         Two of them share a row.
@@ -95,7 +97,8 @@ class Plot:
 
     slug: str
     title: str
-    text: str
+    text: str = ""
+    facts: Mapping[str, Any] = field(default_factory=dict)
     figure: Figure | None = None
     is_half: bool = False
     is_image: bool = False

@@ -54,13 +54,6 @@ class World:
         up = 3 - sum(ground)
         return cls(ground=ground, up=up, is_up_negative=up == 1)
 
-    @property
-    def words(self) -> str:
-        """The axes, as a sentence."""
-        if self.is_up_negative:
-            return "The axes of the world are those of a camera: x right, y down, z forward."
-        return "The z axis of the world is assumed to point up."
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Line:
@@ -105,7 +98,6 @@ def loop_lines(ends: Mapping[str, FloatArray]) -> list[Line]:
 
 def path_plots(lines: Sequence[Line], world: World) -> list[Plot]:
     """Return the views from above, from the side and in space."""
-    scale = "Both axes have one scale; the circle is the start."
     near, labels = _near_origin(lines)
     points = np.concatenate([line.points for line in lines])
     extents = np.nanmax(points, axis=0) - np.nanmin(points, axis=0)
@@ -114,33 +106,26 @@ def path_plots(lines: Sequence[Line], world: World) -> list[Plot]:
         Plot(
             slug="above",
             title=TITLES["above"],
-            text=f"{world.words} {scale} {_good_words(lines)}",
+            facts={
+                "is_up_negative": world.is_up_negative,
+                "has_truth": any(line.name == "truth" for line in lines),
+                "has_loops": any(line.style in LOOP_STYLES.values() for line in lines),
+            },
             figure=_view(near, labels, world.ground, is_flipped=False),
             is_half=True,
         ),
         Plot(
             slug="side",
             title=TITLES["side"],
-            text=f"{scale} Odometry drifts in height first: look for a slow climb or descent.",
             figure=_view(near, labels, (along, world.up), is_flipped=world.is_up_negative),
             is_half=True,
         ),
         Plot(
             slug="space",
             title=TITLES["space"],
-            text="The same paths; all three axes have one scale.",
             figure=_space(near, labels, world),
         ),
     ]
-
-
-def _good_words(lines: Sequence[Line]) -> str:
-    words = "Without ground truth, look for jumps and for a path that cannot be what was driven."
-    if any(line.name == "truth" for line in lines):
-        words = "In a good run the estimates lie on the dashed ground truth at this scale."
-    if any(line.style in LOOP_STYLES.values() for line in lines):
-        words += " Thin lines join both ends of a loop, dashed where it was refused."
-    return words
 
 
 def _near_origin(lines: Sequence[Line]) -> tuple[list[Line], list[str]]:

@@ -38,12 +38,6 @@ from gvo.viz.palette import Style, styles_of
 _ROW_HEIGHT = 2.1
 _SIGMAS = 3.0
 _RAW = Style(color=palette.ESTIMATES["raw"], linewidth=1.1, zorder=3.0)
-_ALIGNED = {
-    "none": "without alignment",
-    "origin": "with the first poses aligned",
-    "se3": "after SE(3) alignment",
-    "sim3": "after Sim(3) alignment",
-}
 # index into errors, letter and unit: translations in the upper row, rotations below
 _PANELS = (
     *((3, "x", "m"), (4, "y", "m"), (5, "z", "m")),
@@ -73,41 +67,32 @@ TITLES = {
 
 def not_drawn(slugs: Iterable[str], reason: str) -> list[Plot]:
     """Return plots that say why they are not drawn."""
-    return [_plot(slug, text=f"Not drawn: {reason}.") for slug in slugs]
+    return [_not_drawn(slug, reason) for slug in slugs]
 
 
-def _plot(slug: str, *, text: str, figure: Figure | None = None) -> Plot:
-    return Plot(slug=slug, title=TITLES[slug], text=text, figure=figure)
+def _not_drawn(slug: str, reason: str) -> Plot:
+    return Plot(slug=slug, title=TITLES[slug], text=f"Not drawn: {reason}.")
+
+
+def _plot(slug: str, figure: Figure, **facts: object) -> Plot:
+    """Return a plot, whose words are in `pages/plots.html`."""
+    return Plot(slug=slug, title=TITLES[slug], figure=figure, facts=facts)
 
 
 def error_plots(comparisons: Sequence[Comparison], align: AlignMode) -> list[Plot]:
     """Return the errors over time and over the distance travelled."""
-    rotations = (
-        "Rotation errors are those of the rotation since the first pose."
-        if any(c.errors_rad is not None for c in comparisons)
-        else "The ground truth holds no rotations: there are no rotation errors."
-    )
     first_ns = min(int(c.reference.stamps_ns[0]) for c in comparisons)
     is_by_row = any(c.reference.stamps_from == "rows" for c in comparisons)
+    over_time = _curves(
+        comparisons,
+        lambda c: elapsed(c.reference.stamps_ns, first_ns),
+        "row" if is_by_row else "elapsed [s]",
+    )
+    travelled = _curves(comparisons, lambda c: c.reference.distances(), "distance travelled [m]")
+    has_rotations = any(c.errors_rad is not None for c in comparisons)
     return [
-        _plot(
-            "errors_over_time",
-            text=f"Position errors {_ALIGNED[align]}. {rotations} "
-            "Good curves are low and smooth; a step is a single bad frame.",
-            figure=_curves(
-                comparisons,
-                lambda c: elapsed(c.reference.stamps_ns, first_ns),
-                "row" if is_by_row else "elapsed [s]",
-            ),
-        ),
-        _plot(
-            "errors_over_distance",
-            text="The same errors over the distance along the true path: a steady slope is drift "
-            "in metres per metre; while the camera stands still, so must the curve.",
-            figure=_curves(
-                comparisons, lambda c: c.reference.distances(), "distance travelled [m]"
-            ),
-        ),
+        _plot("errors_over_time", over_time, align=align, has_rotations=has_rotations),
+        _plot("errors_over_distance", travelled),
     ]
 
 
@@ -150,18 +135,11 @@ def drift_plot(
             if any(c.errors_rad is None for c in comparisons)
             else f"the path of {path_m:.2g} m is too short for segments"
         )
-        return _plot("drift", text=f"Not drawn: {reason}.")
+        return _not_drawn("drift", reason)
     origin = "the lengths asked for" if is_asked else f"round lengths for a path of {path_m:.3g} m"
     if lengths == KITTI_SEGMENTS_M:
         origin = "the standard lengths of the KITTI benchmark"
-    return _plot(
-        "drift",
-        text=f"Mean error over all segments of a length, as in KITTI's devkit; {origin}. "
-        "Translation drift falls with the length where errors are random, and stays level where "
-        "scale or heading is biased; rotation drift should fall as well. The longest length is "
-        f"the mean of {n_segments} overlapping segments.",
-        figure=_drift_figure(found),
-    )
+    return _plot("drift", _drift_figure(found), origin=origin, n_segments=n_segments)
 
 
 def _drift_figure(found: Sequence[tuple[str, Drift | None]]) -> Figure:
@@ -184,14 +162,8 @@ def _drift_figure(found: Sequence[tuple[str, Drift | None]]) -> Figure:
 def covariance_plot(item: Consistency, first_ns: int) -> Plot:
     """Return errors of motions with their 3-sigma bands."""
     inside = 100.0 * np.mean(np.abs(item.errors) <= _SIGMAS * item.sigmas, axis=0)
-    return _plot(
-        "covariance",
-        text=f"Errors of the motion, {item.name}, along the axes of its last pose, with the "
-        f"stated 3-sigma bands; nothing is aligned. Inside are {inside[3:].mean():.1f} % of the "
-        f"position and {inside[:3].mean():.1f} % of the rotation errors; 99.7 % where the "
-        "covariances fit and the truth is exact. Noise of the true poses counts as error.",
-        figure=_bands(item, first_ns),
-    )
+    shares = {"position": inside[3:].mean(), "rotation": inside[:3].mean()}
+    return _plot("covariance", _bands(item, first_ns), name=item.name, **shares)
 
 
 def _bands(item: Consistency, first_ns: int) -> Figure:
@@ -217,13 +189,8 @@ def _bands(item: Consistency, first_ns: int) -> Figure:
 def status_plot(frames: Table) -> Plot:
     """Return the ribbon of statuses, a row for each that occurs."""
     if len(frames["stamp_ns"]) == 0:
-        return _plot("status", text="Not drawn: the run has no frame.")
-    return _plot(
-        "status",
-        text="The status of each frame, with a row and the number of frames for each status that "
-        "occurs; single frames are widened to be seen. A good run has one row: ok.",
-        figure=_ribbon(frames),
-    )
+        return _not_drawn("status", "the run has no frame")
+    return _plot("status", _ribbon(frames))
 
 
 def _ribbon(frames: Table) -> Figure:
@@ -271,7 +238,7 @@ def count_plot(frames: Table) -> Plot:
     present = {n: frames[f"n_{n}"] for n in palette.COUNTS if f"n_{n}" in frames}
     has_pose = frames["status"] != "skipped"
     if not present or not np.any(has_pose):
-        return _plot("counts", text="Not drawn: the run has no counts; its edges were given.")
+        return _not_drawn("counts", "the run has no counts; its edges were given")
     figure, axes = _time_axes(3.0, "number per frame [-]")
     x = elapsed(frames["stamp_ns"], int(frames["stamp_ns"][0]))
     for name, counts in present.items():
@@ -281,32 +248,24 @@ def count_plot(frames: Table) -> Plot:
         draw_curve(axes, x, y, Style(color=palette.COUNTS[name]), label=name)
     axes.set_ylim(bottom=0.0)
     legend_above(figure, axes)
-    text = (
-        "Keypoints, points with depth, matches with the previous frame, and inliers of the motion. "
-        "Good curves lie near each other and far above ransac.min_inliers; "
-        f"{_inlier_words(frames)}"
-    )
-    return _plot("counts", text=text, figure=figure)
+    return _plot("counts", figure, **_inlier_facts(frames))
 
 
-def _inlier_words(frames: Table) -> str:
+def _inlier_facts(frames: Table) -> dict[str, float]:
+    """Return inliers of the median and of the worst frame that was matched, if any was."""
     matches, inliers = frames.get("n_matches"), frames.get("n_inliers")
     if matches is None or inliers is None or not np.any(matches > 0):
-        return "here no frame was matched."
-    is_matched = matches > 0
-    share = 100.0 * float(np.median(inliers[is_matched] / matches[is_matched]))
-    median, fewest = np.median(inliers[is_matched]), inliers[is_matched].min()
-    return (
-        f"here the median frame has {median:.0f} inliers, {share:.0f} % of its matches, and the "
-        f"worst matched frame {fewest}."
-    )
+        return {}
+    matches, inliers = matches[matches > 0], inliers[matches > 0]
+    share = 100.0 * float(np.median(inliers / matches))
+    return {"median": np.median(inliers), "share": share, "fewest": inliers.min()}
 
 
 def timing_plot(timings: Table) -> Plot:
     """Return the milliseconds per frame, stacked by stage."""
     stages_ms = {name: values for name, values in timings.items() if name.endswith("_ms")}
     if not stages_ms or len(timings["stamp_ns"]) == 0:
-        return _plot("timings", text="Not drawn: the run has no times of its stages.")
+        return _not_drawn("timings", "the run has no times of its stages")
     table = np.nan_to_num(np.stack(list(stages_ms.values())))
     total = table.sum(axis=0)
     median, slow = np.quantile(total, [0.5, 0.95])
@@ -316,13 +275,12 @@ def timing_plot(timings: Table) -> Plot:
     axes.axhline(slow, color="black", lw=1.0, ls=":", label=f"95 %: {slow:.1f}")
     axes.set_ylim(0.0, 1.05 * float(total.max()) or 1.0)
     legend_above(figure, axes)
-    return _plot(
-        "timings",
-        text="Wall time of each frame, stacked by stage, with the medians in brackets. The median "
-        f"frame took {median:.1f} ms, 95 % took less than {slow:.1f} ms, the slowest "
-        f"{total.max():.1f} ms. {_rate_words(timings, total)}",
-        figure=figure,
-    )
+    period_ms = share = 0.0
+    if len(total) > 1:
+        period_ms = float(np.median(np.diff(np.sort(timings["stamp_ns"])))) / 1e6
+        share = 100.0 * float(np.mean(total > period_ms))
+    facts = {"median": median, "slow": slow, "slowest": total.max()}
+    return _plot("timings", figure, period_ms=period_ms, share=share, **facts)
 
 
 def _stack(axes: Axes, timings: Table, table: FloatArray) -> None:
@@ -334,42 +292,21 @@ def _stack(axes: Axes, timings: Table, table: FloatArray) -> None:
     axes.stackplot(x, table, labels=labels, colors=colours, **looks)
 
 
-def _rate_words(timings: Table, total: FloatArray) -> str:
-    if len(timings["stamp_ns"]) < 2:
-        return "A good run stays below the frame period."
-    period_ms = float(np.median(np.diff(np.sort(timings["stamp_ns"])))) / 1e6
-    share = 100.0 * float(np.mean(total > period_ms))
-    return (
-        f"A good run stays below the frame period of {period_ms:.1f} ms; {share:.1f} % of the "
-        "frames took longer."
-    )
-
-
 def edge_plots(edges: Table, first_ns: int) -> list[Plot]:
     """Return the chi-square of the edges over time, and its histogram."""
     if not edges or not np.any(np.isfinite(edges["chi2"])):
-        reason = "Not drawn: the run has no edges with residuals."
-        return [_plot(slug, text=reason) for slug in ("chi2", "chi2_histogram")]
+        return not_drawn(("chi2", "chi2_histogram"), "the run has no edges with residuals")
     bound = chi2_bound(0.95)
-    n_edges, n_refused = len(edges["chi2"]), int(np.count_nonzero(~edges["is_accepted"]))
+    n_refused = int(np.count_nonzero(~edges["is_accepted"]))
+    numbers = {"floor": _FLOOR, "n_refused": n_refused, "n_edges": len(edges["chi2"])}
+    parts = []
+    for kind in palette.LINKS:
+        values = edges["chi2"][_is_free(edges) & (edges["kind"] == kind)]
+        if len(values) > 0:
+            parts.append((kind, values.mean(), 100.0 * np.mean(values > bound)))
     return [
-        _plot(
-            "chi2",
-            text="Squared residual of each edge over its stated covariance, after the window was "
-            f"optimized with its frame; values under {_FLOOR:g} are drawn there. A residual with "
-            f"six degrees of freedom has mean {N_DOF}, and 95 % are under {bound:.1f}. "
-            "These lie lower: the poses are fitted to the edges. Look for stretches near the "
-            f"bound and for refused edges: {n_refused} of {n_edges} here.",
-            figure=_dots(edges, first_ns, bound),
-        ),
-        _plot(
-            "chi2_histogram",
-            text="The same of the accepted edges, with the density for six degrees of freedom; "
-            f"the outermost bins include everything beyond. {_mean_words(edges, bound)} Bars left "
-            "of the curve mean conservative covariances, bars right of it too small ones. Frames "
-            "with a single edge fit it exactly and are left out.",
-            figure=_histogram(edges, bound),
-        ),
+        _plot("chi2", _dots(edges, first_ns, bound), bound=bound, **numbers),
+        _plot("chi2_histogram", _histogram(edges, bound), bound=bound, parts=parts),
     ]
 
 
@@ -378,16 +315,6 @@ def _is_free(edges: Table) -> Any:  # noqa: ANN401
     _, inverse = np.unique(edges["stamp_ns"], return_inverse=True)
     n_accepted = np.bincount(inverse, weights=edges["is_accepted"])[inverse]
     return np.isfinite(edges["chi2"]) & edges["is_accepted"] & (n_accepted > 1)
-
-
-def _mean_words(edges: Table, bound: float) -> str:
-    is_free, parts = _is_free(edges), []
-    for kind in palette.LINKS:
-        values = edges["chi2"][is_free & (edges["kind"] == kind)]
-        if len(values) > 0:
-            above = 100.0 * float(np.mean(values > bound))
-            parts.append(f"{kind}: mean {values.mean():.2g}, {above:.1f} % above {bound:.1f}")
-    return f"Here: {'; '.join(parts)}." if parts else "No frame here has more than one edge."
 
 
 def _dots(edges: Table, first_ns: int, bound: float) -> Figure:
