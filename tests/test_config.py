@@ -31,11 +31,6 @@ def test_nothing_given_is_the_default() -> None:
     assert load_configuration() == Config()
 
 
-@pytest.mark.parametrize("text", ["", "# only a comment\n", "window: {}\n"])
-def test_a_file_that_sets_nothing_is_the_default(tmp_path: Path, text: str) -> None:
-    assert load_configuration(write(tmp_path, text)) == Config()
-
-
 def test_a_file_sets_what_it_names(tmp_path: Path) -> None:
     path = write(tmp_path, "window:\n  size: 7\ndepth:\n  scale: 2000\n")
     config = load_configuration(path)
@@ -50,37 +45,18 @@ def test_settings_win_over_the_file_and_later_ones_over_earlier(tmp_path: Path) 
     assert (config.window.size, config.window.n_links) == (9, 4)
 
 
-@pytest.mark.parametrize(("text", "value"), [("null", None), ("1e3", 1000.0), ("5000", 5000.0)])
-def test_values_of_settings_are_yaml(text: str, value: float | None) -> None:
-    settings = ["depth.scale=7", f"depth.scale={text}"]
-    assert load_configuration(settings=settings).depth.scale == value
-
-
 @pytest.mark.parametrize(
     ("setting", "nearest"),
     [
         ("window.sizee=5", "window.size"),
-        ("ransac.n_hypothesis=5", "ransac.n_hypotheses"),
-        ("features.n_feature=500", "features.n_features"),
         ("depth.sigma=1", "depth.sigma_px"),
+        ("windw.n_links=3", "window"),
     ],
 )
 def test_an_unknown_key_names_the_nearest(setting: str, nearest: str) -> None:
     message = refusal(settings=(setting,))
     assert setting.partition("=")[0] in message
     assert f"did you mean {nearest}?" in message
-
-
-@pytest.mark.parametrize(
-    ("section", "nearest"), [("windw", "window"), ("feature", "features"), ("ransak", "ransac")]
-)
-def test_an_unknown_section_names_the_nearest(tmp_path: Path, section: str, nearest: str) -> None:
-    for message in (
-        refusal(write(tmp_path, f"{section}:\n  n_links: 3\n")),
-        refusal(settings=(f"{section}.n_links=3",)),
-    ):
-        assert section in message
-        assert f"did you mean {nearest}?" in message
 
 
 def test_a_file_is_named_where_the_fault_is_in_it(tmp_path: Path) -> None:
@@ -95,27 +71,15 @@ def test_a_file_is_named_where_the_fault_is_in_it(tmp_path: Path) -> None:
     ("setting", "key"),
     [
         ("window.size=1", "window.size"),
-        ("window.min_overlap=1.5", "window.min_overlap"),
-        ("stereo.max_distance=0", "stereo.max_distance"),
-        ("depth.scale=-5", "depth.scale"),
         ("depth.scale=.nan", "depth.scale"),
-        ("depth.scale=nan", "depth.scale"),
         ("stereo.max_depth_m=.inf", "stereo.max_depth_m"),
-        ("ransac.seed=-1", "ransac.seed"),
         ("ransac.seed=1.5", "ransac.seed"),
         ("features.kind=akaze", "features.kind"),
         ("window.size=five", "window.size"),
-        ("window.size=[5]", "window.size"),
     ],
 )
 def test_values_out_of_range_are_refused_by_name(setting: str, key: str) -> None:
     assert refusal(settings=(setting,)).startswith(f"{key}=")
-
-
-def test_a_choice_names_its_alternatives() -> None:
-    message = refusal(settings=("window.kernel=tukey",))
-    assert "huber" in message
-    assert "none" in message
 
 
 @pytest.mark.parametrize("section", ["depth", "stereo"])
@@ -125,34 +89,22 @@ def test_nearest_depth_must_lie_below_the_farthest(section: str) -> None:
     assert f"{section}.max_depth_m=5.0" in message
 
 
-@pytest.mark.parametrize("setting", ["n_links=3", "window.n_links", "window", "", "=3"])
+@pytest.mark.parametrize("setting", ["n_links=3", "window.n_links", "=3"])
 def test_settings_of_another_form_are_refused_with_an_example(setting: str) -> None:
     assert "section.key=value" in refusal(settings=(setting,))
 
 
-@pytest.mark.parametrize("value", ["[1", "{a", "2024-99-99", "'"])
-def test_settings_that_are_no_yaml_are_refused(value: str) -> None:
-    assert value in refusal(settings=(f"window.n_links={value}",))
-
-
 @pytest.mark.parametrize(
-    "text", ["window: [1\n", "a: b: c\n", "window:\n\tn_links: 3\n", "window: 2024-99-99\n"]
+    "text", ["window: [1\n", "window:\n\tn_links: 3\n", "window: 2024-99-99\n"]
 )
 def test_a_file_that_is_no_yaml_is_refused_by_name(tmp_path: Path, text: str) -> None:
     path = write(tmp_path, text)
     assert str(path) in refusal(path)
 
 
-@pytest.mark.parametrize("text", ["- 1\n", "just text\n", "3\n", "window: 3\n", "window:\n"])
+@pytest.mark.parametrize("text", ["- 1\n", "just text\n", "window: 3\n", "1: {a: 2}\n"])
 def test_a_file_that_holds_no_sections_is_refused(tmp_path: Path, text: str) -> None:
     assert "settings.yaml" in refusal(write(tmp_path, text))
-
-
-@pytest.mark.parametrize("text", ["1: {a: 2}\n", "windw: 3\n", "true: 1\n"])
-def test_strange_sections_are_refused_even_beside_settings(tmp_path: Path, text: str) -> None:
-    path = write(tmp_path, text)
-    refusal(path)
-    refusal(path, ("windw.n_links=3",))
 
 
 def test_an_unreadable_file_is_refused_by_name(tmp_path: Path) -> None:
@@ -167,10 +119,8 @@ def test_an_unreadable_file_is_refused_by_name(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("klt.max_return_px", "0.5"),
         ("window.kernel_threshold", "null"),
         ("depth.icp", "auto"),
-        ("check.n_samples", "12"),
     ],
 )
 def test_a_parameter_that_has_gone_is_refused_with_its_fixed_value(key: str, value: str) -> None:
@@ -199,16 +149,6 @@ def test_without_those_for_experts_the_few_and_the_changed_are_listed() -> None:
     assert few["klt"] == {"n_corners": 300}
     assert sum(map(len, few.values())) < 20
     assert Config.model_validate(few) == config
-
-
-def test_the_page_advises_to_turn_what_gvo_config_lists() -> None:
-    page = (Path(__file__).parents[1] / "docs/configuration.md").read_text(encoding="utf-8")
-    advised = page.partition("## Turn these first")[2].partition("## All parameters")[0]
-    named = set(re.findall(r"`([a-z]+\.[a-z_]+)(?:=[^`]*)?`", advised)) - {"config.yaml"}
-    few = yaml.safe_load(describe_configuration(Config(), for_experts=False))
-    listed = {f"{section}.{key}" for section, values in few.items() for key in values}
-    assert 5 <= len(named) <= len(listed)
-    assert named <= listed
 
 
 def test_the_description_tells_unit_range_and_choices() -> None:
@@ -246,10 +186,6 @@ def test_a_description_read_back_is_the_same_configuration(
     config = Config.model_validate(values)
     path = write(tmp_path_factory.mktemp("described"), describe_configuration(config))
     assert load_configuration(path) == config
-
-
-def test_the_description_is_plain_yaml() -> None:
-    assert yaml.safe_load(describe_configuration(Config())) == Config().model_dump()
 
 
 def test_a_configuration_cannot_be_changed() -> None:

@@ -70,8 +70,7 @@ def test_nothing_large_is_loaded_before_needed(room_bag: Path, poses: Path, tmp_
         command("batch", "--help"),
         f"track({str(room_bag)!r})",
         command("compare", poses, poses),
-        command("run", *options, "--out", tmp_path / "out"),
-        command("run", *options, "--out", tmp_path / "filmed", "--overlay", film),
+        command("run", *options, "--out", tmp_path / "out", "--overlay", film),
     ]
     found = loaded_by(*actions)
     assert dict(zip(actions, found, strict=True)) == {action: [0, []] for action in actions}

@@ -55,12 +55,6 @@ def test_commands_and_options_within_sentences_are_there(page: Path) -> None:
     assert [span for span in spans(page) if unknown(span)] == []
 
 
-def test_what_is_not_there_is_seen() -> None:
-    assert unknown("gvo run FILE --bag B -v") == []
-    assert unknown("gvo runs") == ["runs"]
-    assert unknown("gvo run --smooth") == ["--smooth"]
-
-
 def compared() -> dict[str, tuple[str, str]]:
     """Return the comparison with others: what each has, and what gvo has."""
     section = README.partition("\n## Beside others\n")[2].partition("\n## ")[0]

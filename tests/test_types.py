@@ -3,18 +3,11 @@
 import numpy as np
 import pytest
 
-from gvo.types import Edge, Estimate, Failure, RelativePose, RgbdFrame, StereoFrame
-from tests.make.results import observations_of
+from gvo.types import Edge, Estimate, RelativePose, RgbdFrame, StereoFrame
 
 
 def grey(*shape: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
     return np.zeros(shape, dtype=np.uint8)
-
-
-def test_a_failure_is_falsy_and_keeps_its_numbers() -> None:
-    failure = Failure(reason="7 matches", n_matches=7, n_inliers=3)
-    assert not failure
-    assert (failure.reason, failure.n_matches, failure.n_inliers) == ("7 matches", 7, 3)
 
 
 def test_a_relative_pose_is_truthy_and_counts_its_matches() -> None:
@@ -74,10 +67,6 @@ def test_edges_and_estimates_keep_copies_that_nobody_can_write_to() -> None:
         assert array[0, 0] == 1.0
         with pytest.raises(ValueError, match="read-only"):
             array[0, 0] = 2.0
-
-
-def test_observations_count_their_points() -> None:
-    assert len(observations_of(0, np.zeros((4, 3)), n_keypoints=9)) == 4
 
 
 def test_an_estimate_shows_its_position_along_the_axes_of_the_world() -> None:

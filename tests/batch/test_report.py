@@ -70,13 +70,6 @@ def test_a_sweep_has_its_totals_boxes_medians_and_runs(tmp_path: Path) -> None:
     assert places == sorted(places)  # the most accurate first
 
 
-def test_one_configuration_is_drawn_by_recording(tmp_path: Path) -> None:
-    page = page_of(tmp_path, made_up(["x"], 3))
-    assert page.drawn == ["boxes"]
-    assert "A row per recording" in page.text
-    assert "configurations" not in page.ids
-
-
 def test_the_worst_runs_come_first_and_reports_are_linked(tmp_path: Path) -> None:
     rows = [*made_up(["x"], 3), failed(recording="gone", folder="gone")]
     (tmp_path / "drive_1" / "default").mkdir(parents=True)

@@ -11,11 +11,11 @@ from distributed import Client
 
 import gvo
 import gvo.batch
-from gvo.batch import BatchOptions, BatchProgress, Variant, run, run_batch
-from gvo.batch.inputs import NamedRecording, find_recordings, make_variants
+from gvo.batch import BatchOptions, BatchProgress, run
+from gvo.batch.inputs import NamedRecording, make_variants
 from gvo.batch.running import make_tasks
 from gvo.errors import OutputError
-from tests.batch.conftest import NO_REPORT, copy_of, state_of
+from tests.batch.conftest import NO_REPORT, state_of
 from tests.conftest import assert_same_files
 
 FORCED = BatchOptions(report=False, force=True)
@@ -135,15 +135,6 @@ def test_a_table_that_cannot_be_written_ends_the_batch(
     assert error is not None
 
 
-def test_names_of_files_may_be_no_text(near: Client, bags: Path, tmp_path: Path) -> None:
-    name = b"w\xffalk.mcap".decode(errors="surrogateescape")
-    copy_of(bags / "walk0.mcap", tmp_path / "in", name)
-    (tmp_path / "in" / b"\xfe.bag".decode(errors="surrogateescape")).touch()
-    table = run(tmp_path / "in", out=tmp_path / "out", client=near, options=NO_REPORT)
-    assert sorted(table["status"]) == ["complete", "failed"]
-    assert len(pd.read_csv(tmp_path / "out" / "results.csv")) == 2
-
-
 def test_tasks_are_all_pairs_in_folders_of_their_own() -> None:
     recordings = [NamedRecording(name=name, location=f"/{name}.bag") for name in "ab"]
     variants = make_variants(sweeps=["window.size=3,4", "window.gate=null,9.5"])
@@ -153,13 +144,6 @@ def test_tasks_are_all_pairs_in_folders_of_their_own() -> None:
     assert tasks[1].parameters == {"window.size": 3, "window.gate": 9.5}
     (single,) = make_tasks(recordings[:1], variants[:1])
     assert (single.folder, single.parameters) == ("a", {})
-
-
-def test_what_is_named_already_is_run(near: Client, bags: Path, tmp_path: Path) -> None:
-    (found,) = find_recordings([bags / "walk0.mcap"])
-    variant = Variant(name="mine", config=with_size(3))
-    table = run_batch([found], [variant], out=tmp_path, client=near, options=NO_REPORT)
-    assert (table["variant"][0], table["folder"][0]) == ("mine", "walk0")
 
 
 def test_public_names_are_there() -> None:

@@ -14,7 +14,7 @@ from gvo.io.convert.convert import convert
 from gvo.io.recording import StampedImage
 from gvo.io.synthetic import SyntheticRecording
 from gvo.trajectory.formats import read_trajectory
-from tests.conftest import Command, assert_same_files, refused, run_of
+from tests.conftest import Command, refused
 from tests.io.conftest import Item, ListSource, Tiny
 
 _TRAJECTORIES = ("raw.txt", "causal.txt", "smoothed.txt")
@@ -45,15 +45,6 @@ def _rows(kitti: Path) -> list[str]:
 
 def _images(folder: Path) -> list[StampedImage]:
     return list(gvo.open_recording(folder).images())
-
-
-def test_a_run_on_what_comes_back_writes_the_same_bytes(command: Command, tmp_path: Path) -> None:
-    convert(SyntheticRecording("handheld", "stereo", n_frames=4, scale=0.25), tmp_path / "a.mcap")
-    assert command("convert", tmp_path / "a.mcap", tmp_path / "kitti").code == 0
-    assert command("convert", tmp_path / "kitti", tmp_path / "b.bag", "--png").code == 0
-    for name in ("a.mcap", "kitti", "b.bag"):
-        run_of(tmp_path / name, tmp_path / f"run_{name}")
-        assert_same_files(tmp_path / f"run_{name}", tmp_path / "run_a.mcap", _TRAJECTORIES)
 
 
 def test_the_body_of_a_data_set_is_a_frame_of_its_bag(command: Command, tmp_path: Path) -> None:
@@ -104,18 +95,17 @@ def _noise(stamps_ns: Sequence[int], delay_ns: int = 0) -> ListSource:
 def test_a_bag_that_is_cut_off_gives_what_it_holds_and_exit_code_3(
     command: Command, tmp_path: Path, kitti: Path
 ) -> None:
-    convert(_noise([10**8 * k for k in range(800)]), tmp_path / "whole.bag")
+    convert(_noise([10**8 * k for k in range(300)]), tmp_path / "whole.bag")
     data = (tmp_path / "whole.bag").read_bytes()
     (tmp_path / "cut.bag").write_bytes(data[: len(data) * 2 // 3])
-    for target in ("folder", "b.mcap"):
-        answer = command("convert", tmp_path / "cut.bag", tmp_path / target)
-        assert answer.code == 3
-        assert "missing" in answer.err
-        assert len(answer.err.splitlines()) <= 8
-        copies = [i.load() for i in gvo.open_recording(tmp_path / target).images() if not i.stream]
-        assert 100 < len(copies) < 800
-        for k, pixels in enumerate(copies):
-            np.testing.assert_array_equal(pixels, Tiny().texture(2 * k))
+    answer = command("convert", tmp_path / "cut.bag", tmp_path / "b.mcap")
+    assert answer.code == 3
+    assert "missing" in answer.err
+    assert len(answer.err.splitlines()) <= 8
+    copies = [i.load() for i in gvo.open_recording(tmp_path / "b.mcap").images() if not i.stream]
+    assert 50 < len(copies) < 300
+    for k, pixels in enumerate(copies):
+        np.testing.assert_array_equal(pixels, Tiny().texture(2 * k))
 
 
 def test_several_bags_become_one_folder(command: Command, tmp_path: Path) -> None:
@@ -126,15 +116,6 @@ def test_several_bags_become_one_folder(command: Command, tmp_path: Path) -> Non
     assert [image.stamp_ns for image in _images(tmp_path / "all") if image.stream == 0] == [
         10**9 * part + 10**8 * k for part in range(2) for k in range(3)
     ]
-
-
-def test_settings_reach_the_pairs_of_kitti(command: Command, tmp_path: Path) -> None:
-    convert(_noise([10**8 * k for k in range(3)], delay_ns=3_000_000), tmp_path / "a.bag")
-    assert command("convert", tmp_path / "a.bag", tmp_path / "none").code == 2
-    answer = command(
-        "convert", tmp_path / "a.bag", tmp_path / "all", "--set", "sync.stereo_tolerance_ms=5"
-    )
-    assert (answer.code, len(_images(tmp_path / "all"))) == (0, 6)
 
 
 @pytest.mark.parametrize(

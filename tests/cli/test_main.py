@@ -15,7 +15,6 @@ from tests.conftest import (
     TABLES,
     Command,
     is_one_line,
-    line_of_poses,
     python,
     refused,
     start,
@@ -37,10 +36,10 @@ def test_config_prints_a_few_or_all_and_is_read_back(command: Command, tmp_path:
 
 
 def test_run_writes_and_prints_errors(command: Command, room_bag: Path, tmp_path: Path) -> None:
-    answer = command("run", room_bag, "--out", tmp_path / "out")
+    answer = command("run", room_bag, "--out", tmp_path / "out", "--duration", "0.2")
     assert answer.code == 0, answer.err
     assert "smoothed" in answer.out
-    assert "m in 20 frames, all tracked; " in answer.out
+    assert "m in 6 frames, all tracked; " in answer.out
     learnt = json.loads((tmp_path / "out" / "summary.json").read_text())["rig_offsets"]
     assert {"readout_ms", "readout_sigma_ms"} <= set(learnt)
     words = describe_offsets(learnt)
@@ -54,7 +53,7 @@ def test_run_writes_and_prints_errors(command: Command, room_bag: Path, tmp_path
 
 def test_a_run_without_a_folder_makes_one(command: Command, room_bag: Path, here: Path) -> None:
     for name in ("gvo-room", "gvo-room-2"):
-        answer = command("run", room_bag, "--no-report", "--duration", "0.3")
+        answer = command("run", room_bag, "--no-report", "--duration", "0.1")
         assert answer.code == 0
         assert (here / name / "summary.json").is_file()
     assert f"{name}\n" in answer.out
@@ -64,16 +63,11 @@ def test_a_run_without_a_folder_makes_one(command: Command, room_bag: Path, here
     "arguments",
     [
         ["run", "missing.bag", "--out", "taken"],
-        ["smooth", "missing.g2o", "--out", "taken"],
-        ["explain", "missing.bag", "--frame", "1", "--out", "taken"],
         ["run", "missing.bag", "--bag", "taken"],
         ["run", "missing.bag", "--overlay", "taken/summary.json"],
-        ["run", "missing.bag", "--rerun", "taken/summary.json"],
-        ["run", "missing.bag", "--plots", "taken/summary.json"],
         ["run", "missing.bag", "--plots", "taken"],
         ["compare", "missing.txt", "missing.txt", "--plot", "taken/summary.json"],
         ["compare", "missing.txt", "missing.txt", "--report", "taken/summary.json"],
-        ["compare", "missing.txt", "missing.txt", "--plots", "taken"],
         ["convert", "missing.bag", "taken"],
         ["demo", "--out", "taken"],
     ],
@@ -92,29 +86,19 @@ def test_what_is_there_is_refused_before_a_recording_is_opened(
 
 def test_a_run_is_replaced_if_asked_for(command: Command, room_bag: Path, tmp_path: Path) -> None:
     run = ["run", room_bag, "--out", tmp_path, "--no-report", "--duration"]
-    assert command(*run, "0.3").code == 0
+    assert command(*run, "0.1").code == 0
     before = (tmp_path / "raw.txt").read_text()
-    assert command(*run, "0.4").code == 2
+    assert command(*run, "0.15").code == 2
     assert (tmp_path / "raw.txt").read_text() == before
-    assert command(*run, "0.4", "--force").code == 0
+    assert command(*run, "0.15", "--force").code == 0
     assert (tmp_path / "raw.txt").read_text() != before
-
-
-def test_a_picture_of_a_comparison_is_replaced_if_asked(command: Command, tmp_path: Path) -> None:
-    poses, plot = line_of_poses(tmp_path / "poses.txt"), tmp_path / "plot.png"
-    plot.write_text("mine")
-    words = ["compare", poses, poses, "--plot", plot]
-    said = f"gvo: error: {plot}: exists already; give another path or --force to replace it\n"
-    assert command(*words) == (2, "", said)
-    assert plot.read_text() == "mine"
-    assert command(*words, "--force").code == 0
-    assert plot.read_bytes().startswith(b"\x89PNG")
 
 
 def test_settings_reach_the_run(command: Command, room_bag: Path, tmp_path: Path) -> None:
     (tmp_path / "c.yaml").write_text("window: {size: 4}\nfeatures: {n_features: 300}\n")
     settings = ["--config", tmp_path / "c.yaml", "--set", "features.n_features=400"]
-    command("run", "--no-report", room_bag, "--out", tmp_path / "out", *settings)
+    options = ["--no-report", "--duration", "0.1", *settings]
+    command("run", room_bag, "--out", tmp_path / "out", *options)
     configuration = json.loads((tmp_path / "out/summary.json").read_text())["configuration"]
     assert configuration["window"]["size"] == 4
     assert configuration["features"]["n_features"] == 400
@@ -123,7 +107,7 @@ def test_settings_reach_the_run(command: Command, room_bag: Path, tmp_path: Path
 
 
 def test_a_run_finds_loops_if_asked_for(command: Command, room_bag: Path, tmp_path: Path) -> None:
-    options = ["--no-report", "--duration", "0.3"]
+    options = ["--no-report", "--duration", "0.2"]
     same = "; global is the batch optimum of the same edges\n"
     for out, given, is_global in (
         ("a", ["--set", "loops.enabled=false", "--loops"], True),
@@ -146,7 +130,7 @@ def test_a_run_finds_loops_if_asked_for(command: Command, room_bag: Path, tmp_pa
 
 
 def test_compare_agrees_with_the_run(command: Command, room_bag: Path, tmp_path: Path) -> None:
-    command("run", "--no-report", room_bag, "--out", tmp_path)
+    command("run", "--no-report", room_bag, "--out", tmp_path, "--duration", "0.3")
     answer = command("compare", room_bag, tmp_path / "raw.txt", tmp_path / "smoothed.txt", "--json")
     estimates = json.loads(answer.out)["estimates"]
     errors = json.loads((tmp_path / "summary.json").read_text())["errors"]
@@ -178,25 +162,16 @@ def test_compare_counts_repeated_rows_and_needs_3_poses(command: Command, tmp_pa
         (["run", "missing.bag", "--out", "out"], ["missing.bag", "does not exist"]),
         (["run", ".", "--out", "out"], ["a recording is"]),
         (["run", "{bag}", ".", "--out", "out"], ["only bags can be combined into one recording"]),
-        (["run", "text.bag", "--out", "out"], ["text.bag"]),
         (["run", "{bag}", "--out", "out", "--set", "window.n_link=3"], ["window.n_links"]),
-        (["run", "{bag}", "--out", "out", "--set", "window.n_links=0"], ["window.n_links"]),
-        (["run", "{bag}", "--out", "out", "--set", "window"], ["section.key=value"]),
-        (["run", "{bag}", "--out", "out", "--config", "missing.yaml"], ["missing.yaml"]),
         (["run", "{bag}", "--out", "out", "--color", "/nothing"], ["/nothing"]),
         (["run", "{bag}", "--out", "text.bag"], ["text.bag", "cannot be written"]),
         (["run", "{bag}", "--out", "out", "--ground-truth", "missing.txt"], ["missing.txt"]),
         (["compare", "missing.txt", "missing.txt"], ["missing.txt"]),
-        (["compare", "text.bag", "text.bag"], ["text.bag"]),
         (["compare", "poses.txt", "poses.txt", "--segments", "0"], ["--segments 0"]),
         (["compare", "poses.txt", "poses.txt", "--plot", "plot.gif"], ["plot.gif"]),
-        (["compare", "poses.txt", "poses.txt", "--report", "page.txt"], ["page.txt", ".html"]),
-        (["convert", "missing", "out.bag"], ["missing"]),
-        (["convert", "{bag}", "poses.txt"], ["poses.txt"]),
         (["demo", "--out", "poses.txt"], ["poses.txt", "cannot be written"]),
         (["smooth", "missing.g2o"], ["missing.g2o", "does not exist"]),
         (["smooth", "text.g2o"], ["text.g2o:1"]),
-        (["smooth", "text.bag"], ["text.bag"]),
         (["smooth", "poses.txt", "--topic", "/odom"], ["--topic /odom", "poses.txt"]),
         (["smooth", "poses.txt", "--sigma", "1"], ["--sigma 1", "0.1,0.02"]),
         (["smooth", "poses.txt", "--sigma", "1,2", "--sigma", "1,2"], ["2 times for 1 inputs"]),
@@ -204,27 +179,17 @@ def test_compare_counts_repeated_rows_and_needs_3_poses(command: Command, tmp_pa
         (["smooth", "graph.g2o", "poses.txt"], ["graph.g2o", "one input"]),
         (["smooth", "-", "poses.txt"], ["standard input"]),
         (["smooth", "-", "--topic", "/odom"], ["--topic", "standard input"]),
-        (["smooth", "poses.txt", "--window", "--set", "window.siz=3"], ["window.size"]),
         (["smooth", "poses.txt", "--set", "window.size=3"], ["--set", "--window"]),
         (["smooth", "poses.txt", "--keyframes", "manual"], ["--keyframes", "--window"]),
         (["smooth", "poses.txt", "--window", "--robust", "gnc"], ["--robust", "at once"]),
         (["smooth", "-", "--covariances"], ["--covariances", "at once"]),
-        (["smooth", "poses.txt", "--ground-truth", "missing.txt"], ["missing.txt"]),
         (["smooth", "{bag}"], ["holds no poses"]),
-        (["explain", "missing.bag", "--frame", "1", "--out", "out"], ["missing.bag"]),
-        (["explain", "text.txt", "--frame", "1", "--out", "out"], ["text.txt"]),
         (["explain", "{bag}", "--frame", "99", "--out", "out"], ["99", "20"]),
         (["explain", "{bag}", "--frame", "0", "--out", "text.txt"], ["text.txt"]),
         (["explain", "{bag}", "--frame", "1", "--out", "o", "--every", "0"], ["--every"]),
-        (["explain", "{bag}", "--frame", "1", "--out", "o", "--set", "klt.x=1"], ["klt.x"]),
-        (["view", "missing.bag"], ["missing.bag"]),
         (["view", "."], ["recording"]),
-        (["view", "text.txt"], ["text.txt"]),
-        (["view", "{bag}", "--set", "window.n_link=3"], ["window.n_links"]),
         (["view", "{bag}", "--port", "0", "--host", "203.0.113.7"], ["203.0.113.7"]),
-        (["view", "{bag}", "--color", "/nothing"], ["/nothing"]),
         (["run", "{bag}", "--out", "out", "--overlay", "film.avi"], ["film.avi", ".webm"]),
-        (["run", "{bag}", "--out", "out", "--overlay", "text.txt/film.webm"], ["text.txt"]),
         (["run", "{bag}", "--out", "out", "--no-report", "--plots", "p"], ["--plots"]),
         (["run", "{bag}", "--out", "out", "--every", "9", "--plots", "text.txt"], ["text.txt"]),
     ],
@@ -244,12 +209,6 @@ def test_bad_input_gets_one_line_and_exit_code_2(
     assert Path("text.txt").read_text() == "No recording at all\n"
 
 
-def test_a_long_value_is_shortened(command: Command) -> None:
-    for arguments in (["run", "9" * 5000], ["compare", "a", "b", "--segments", "9" * 5000]):
-        said = refused(command(*arguments, *(["--out", "out"] if arguments[0] == "run" else [])))
-        assert len(said) < 700
-
-
 def test_without_a_command_all_are_listed(command: Command) -> None:
     answer = command()
     assert answer.code == 2
@@ -266,10 +225,11 @@ def test_quiet_prints_errors_alone(command: Command, here: Path, arguments: list
 
 
 def test_verbose_logs_what_is_done(command: Command, room_bag: Path, tmp_path: Path) -> None:
-    answer = command("run", room_bag, "--out", tmp_path / "out", "--no-report", "-v")
+    options = ["--no-report", "--duration", "0.1", "-v"]
+    answer = command("run", room_bag, "--out", tmp_path / "out", *options)
     assert answer.code == 0
     lines = answer.err.splitlines()
-    assert sum(line.startswith("gvo.runs.loop: frame at ") for line in lines) == 20
+    assert sum(line.startswith("gvo.runs.loop: frame at ") for line in lines) == 3
     assert any("parameters: defaults" in line for line in lines)
     assert command("check", room_bag).err == ""
 
@@ -352,19 +312,16 @@ def test_smooth_answers_a_pipe_line_by_line_at_once(tmp_path: Path) -> None:
     assert len(gvo.read_trajectory(tmp_path / "smoothed.txt")) == 2
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_ends_a_waiting_pipe_with_complete_files(
-    tmp_path: Path, number: signal.Signals, code: int
-) -> None:
+def test_a_signal_ends_a_waiting_pipe_with_complete_files(tmp_path: Path) -> None:
     process = start("smooth", "-", "--out", tmp_path)
     assert process.stdin is not None
     assert process.stdout is not None
     for line in (FIRST_LINE, SECOND_LINE):
         process.stdin.write(f"{line}\n")
         process.stdout.readline()
-    process.send_signal(number)
+    process.send_signal(signal.SIGINT)
     # the input stays open: it is the signal that ends the waiting
-    assert process.wait(timeout=60) == code
+    assert process.wait(timeout=60) == 130
     _, errors = process.communicate(timeout=60)
     assert errors.startswith(f"gvo: interrupted; the poses so far are in {tmp_path}")
     assert errors.count("\n") == 1
@@ -375,14 +332,13 @@ def test_a_signal_ends_a_waiting_pipe_with_complete_files(
 @pytest.mark.parametrize(
     ("write", "told"),
     [
-        ("pass", ""),
         (
             "os.write(2, 2 * b'libpng warning: \\x1b[31m\\n')",
             r"2 lines.*: libpng warning: \\x1b\[31m",
         ),
         ("subprocess.run(['sh', '-c', 'yes >&2'])", "more than 16384 lines.*: y"),
     ],
-    ids=["none", "few", "endless"],
+    ids=["few", "endless"],
 )
 def test_what_libraries_write_is_counted_what_gvo_writes_is_shown(write: str, told: str) -> None:
     program = (
@@ -395,5 +351,4 @@ def test_what_libraries_write_is_counted_what_gvo_writes_is_shown(write: str, to
         "os.write(2, b'last')\n"
     )
     answer = python("-c", program)
-    words = f"gvo: warning: {told}\n" if told else ""
-    assert re.fullmatch(f"own\n{words}after\nlast", answer.stderr)
+    assert re.fullmatch(f"own\ngvo: warning: {told}\nafter\nlast", answer.stderr)

@@ -4,7 +4,6 @@ import os
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,13 +19,8 @@ done = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL)
 print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
 sys.exit(done.returncode)
 """
-RECORDING_COMMANDS = (
-    ("run", "{}", "--out", "{out}"),
-    ("check", "{}"),
-    ("convert", "{}", "{out}.mcap"),
-    ("explain", "{}", "--frame", "0", "--out", "{out}"),
-    ("view", "{}", "--port", "0"),
-)
+# All commands open recordings by one function.
+RECORDING_COMMANDS = (("check", "{}"), ("view", "{}", "--port", "0"))
 POSE_COMMANDS = (
     ("smooth", "{}", "--out", "{out}"),
     ("smooth", "{poses}", "--out", "{out}", "--ground-truth", "{}"),
@@ -57,16 +51,6 @@ def make_socket(path: Path) -> None:
         os.chdir(before)
 
 
-@contextmanager
-def written(path: Path, text: str) -> Iterator[None]:
-    """Write into a pipe while it is read."""
-    os.mkfifo(path)
-    writer = threading.Thread(target=path.write_text, args=[text], daemon=True)
-    writer.start()
-    yield
-    writer.join()
-
-
 @pytest.mark.parametrize(
     ("words", "name", "reason"),
     [
@@ -91,21 +75,6 @@ def test_what_is_no_file_is_refused(
     assert reason in refused(command(*filled(words, path, poses)))
 
 
-@pytest.mark.parametrize("words", POSE_COMMANDS)
-def test_poses_come_through_a_pipe(command: Command, poses: Path, words: tuple[str, ...]) -> None:
-    pipe = poses.with_name("pipe")
-    with written(pipe, poses.read_text()):
-        answer = command(*filled(words, pipe, poses))
-    assert answer.code == 0, answer.err
-
-
-def test_a_pose_graph_through_a_pipe_is_refused(command: Command, poses: Path) -> None:
-    pipe = poses.with_name("pipe")
-    with written(pipe, "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n"):
-        answer = command(*filled(POSE_COMMANDS[0], pipe, poses))
-    refused(answer)
-
-
 def test_a_line_of_a_pose_graph_without_an_end_is_refused(command: Command, poses: Path) -> None:
     graph = poses.with_name("endless.g2o")
     with graph.open("wb") as file:
@@ -115,26 +84,20 @@ def test_a_line_of_a_pose_graph_without_an_end_is_refused(command: Command, pose
     assert "a line has more than" in said
 
 
-@pytest.mark.parametrize(
-    ("given", "reason"),
-    [
-        pytest.param("cat /dev/zero", "a line has more than", marks=pytest.mark.acceptance),
-        ("yes", "1000 lines hold no pose"),
-    ],
-)
-def test_endless_input_without_poses_is_refused(tmp_path: Path, given: str, reason: str) -> None:
-    with subprocess.Popen(given.split(), stdout=subprocess.PIPE) as source:
+def test_endless_input_without_poses_is_refused(tmp_path: Path) -> None:
+    with subprocess.Popen(["yes"], stdout=subprocess.PIPE) as source:
         answer = python(*GVO[1:], "smooth", "-", "--out", tmp_path / "out", stdin=source.stdout)
         source.kill()
-    assert reason in refused(answer)
+    assert "1000 lines hold no pose" in refused(answer)
 
 
 @pytest.mark.acceptance
-@pytest.mark.parametrize("words", [*RECORDING_COMMANDS, *TEXT_COMMANDS])
-@pytest.mark.parametrize("endless", ["/dev/zero", "/dev/stdin"])
-def test_what_has_no_end_needs_no_memory(poses: Path, words: tuple[str, ...], endless: str) -> None:
+@pytest.mark.parametrize("words", [RECORDING_COMMANDS[0], POSE_COMMANDS[0], POSE_COMMANDS[2]])
+def test_what_has_no_end_needs_no_memory(poses: Path, words: tuple[str, ...]) -> None:
     with subprocess.Popen(["yes"], stdout=subprocess.PIPE) as source:
-        answer = python("-c", MEASURED, *GVO, *filled(words, endless, poses), stdin=source.stdout)
+        answer = python(
+            "-c", MEASURED, *GVO, *filled(words, "/dev/stdin", poses), stdin=source.stdout
+        )
         source.kill()
     refused(answer)
     assert int(answer.stdout) * (1 if sys.platform == "darwin" else 1024) < 1 << 30
@@ -157,7 +120,7 @@ def without_rights(path: Path) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("words", [*RECORDING_COMMANDS, *POSE_COMMANDS])
-@pytest.mark.parametrize("inside", ["", "a.bag", "deep/a.bag"])
+@pytest.mark.parametrize("inside", ["", "deep/a.bag"])
 def test_a_folder_without_permission_is_named(
     command: Command, poses: Path, words: tuple[str, ...], inside: str
 ) -> None:

@@ -27,19 +27,10 @@ def test_the_robot_of_the_drive_goes_ahead_on_the_ground(drive_bag: Path, tmp_pa
     assert abs(z) < 0.1
 
 
-@pytest.mark.parametrize("name", [BAG_NAME, ROBOT_NAME, "raw.txt"])
+@pytest.mark.parametrize("name", [BAG_NAME, "raw.txt"])
 def test_the_demonstration_replaces_nothing_but_its_own(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("mine")
     with pytest.raises(RecordingError, match=f"{name}.*; give another [^-]*(--out)?[^-]*$"):
         run_demo(tmp_path)
     assert (tmp_path / name).read_text() == "mine"
     assert [path.name for path in tmp_path.iterdir()] == [name]
-
-
-def test_the_demonstration_makes_its_own_folder_anew(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("gvo.runs.demo.N_FRAMES", 3)
-    for _ in range(2):
-        assert run_demo(tmp_path).is_complete
-        (tmp_path / BAG_NAME).write_text("broken off")

@@ -4,11 +4,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
-from gvo.backend.window import SlidingWindow
 from gvo.config import Config
 from gvo.errors import OutputError, RecordingError
 from gvo.geometry import se3
@@ -17,8 +15,8 @@ from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import Sensor
 from gvo.io.synthetic import SyntheticRecording
 from gvo.odometry.odometry import Odometry
-from gvo.runs.loop import RunLoop, edge_over
-from gvo.types import Edge, Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Optimum, Progress
+from gvo.runs.loop import RunLoop
+from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Optimum, Progress
 from tests.make.recordings import Held, hold
 from tests.make.rendered_walk import CAMERA, T_BASE_CAM, moved_by_hand
 
@@ -196,29 +194,6 @@ def test_an_image_without_partner_is_a_loss_of_stereo_alone(sensor: Sensor, n_lo
     assert loop.statistics.is_complete == (n_lost == 0)
 
 
-def test_interrupted_it_hands_out_the_poses_that_the_window_holds(walk: Held) -> None:
-    kept = Kept()
-
-    def interrupt(progress: Progress) -> None:
-        if progress.n_done == 5:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        loop_over(walk).run([kept], interrupt)
-    assert len(kept.frames) == len(kept.smoothed) == 5
-
-
-def test_a_pose_that_could_not_be_put_into_the_window_has_no_edge_to_it() -> None:
-    window = SlidingWindow()
-    window.add_pose(0, 0, [])
-    assert edge_over(window, 10**9, 10**9) is None
-    step = Edge(reference_id=0, T_reference_frame=np.eye(4), covariance=1e-4 * np.eye(6))
-    window.add_pose(10**9, 10**9, [step])
-    edge = edge_over(window, 10**9, 10**9)
-    assert edge is not None
-    assert edge.reference_id == 0
-
-
 def test_frames_are_counted_also_where_the_last_poses_cannot_be_written(walk: Held) -> None:
     class Full(Kept):
         def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
@@ -228,21 +203,3 @@ def test_frames_are_counted_also_where_the_last_poses_cannot_be_written(walk: He
     with pytest.raises(OutputError, match="no space"):
         loop.run([Full()], None)
     assert loop.statistics.window.n_poses == _N_FRAMES
-
-
-def test_opencv_gets_its_threads_back(walk: Held) -> None:
-    n_before = cv2.getNumThreads()
-    cv2.setNumThreads(2)
-    n_inside = 0
-
-    def fail(*_: object) -> None:
-        nonlocal n_inside
-        n_inside = cv2.getNumThreads()
-        raise KeyboardInterrupt
-
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            loop_over(walk).run([], fail)
-        assert (n_inside, cv2.getNumThreads()) == (1, 2)
-    finally:
-        cv2.setNumThreads(n_before)

@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -52,17 +51,6 @@ def test_a_malformed_line_is_answered_and_the_stream_goes_on(tmp_path: Path) -> 
     assert "needs a stamp" in errors[6]
     assert result.summary["frames"] == 3
     assert "4 lines were not understood" in "\n".join(result.warnings)
-
-
-def test_a_refused_edge_is_told_with_the_estimate(tmp_path: Path) -> None:
-    lines = [request(0), request(1, 0), request(2, 77), request(3, 2)]
-    result, answers = run(lines, tmp_path)
-    reply: dict[str, Any] = json.loads(answers[2])
-    assert reply["status"] == "coasting"
-    assert "77" in reply["rejected"][0]
-    # at the last velocity
-    np.testing.assert_allclose(reply["pose"][:3], [0, 0, 2], atol=1e-6)
-    assert not result.is_complete
 
 
 def test_a_known_pose_takes_more_edges_and_priors(tmp_path: Path) -> None:

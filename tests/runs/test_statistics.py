@@ -96,15 +96,3 @@ def test_segments_that_nothing_ties_to_others_are_a_warning() -> None:
     add(statistics, 500, Status.OK, 2, (2, 0))
     assert [segment.joined_to for segment in statistics.segments.values()] == [None, 0, 1]
     assert statistics.unjoined == [statistics.segments[0]]
-
-
-def test_a_segment_without_any_registration_is_not_one_that_could_be_joined() -> None:
-    statistics = RunStatistics()
-    add(statistics, 1, Status.OK, 0)
-    add(statistics, 2, Status.LOST, 1)
-    assert len(statistics.segments) == 2
-    assert len(statistics.unjoined) == 1
-
-
-def test_nothing_is_covered_where_there_is_no_frame() -> None:
-    assert RunStatistics().coverage_percent == 0.0

@@ -83,31 +83,9 @@ def test_k_frames_are_dropped_or_black_and_the_others_stay_in_their_order(
     assert stamps(spoilt) == list(range(_N))
 
 
-def test_a_share_of_the_frames_is_dropped_from_both_streams_alike() -> None:
-    source = FaultySource(Small(n_frames=2000), Dropped(share=0.3, seed=4))
-    left, right = stamps(source, 0), stamps(source, 1)
-    assert left == right == stamps(source)
-    assert 1400 - 100 < len(left) < 1400 + 100  # 5 sigma
-    assert stamps(FaultySource(Small(n_frames=2000), Dropped(share=0.3, seed=5))) != left
-
-
-def test_one_stream_alone_can_be_affected() -> None:
-    source = FaultySource(Small(), Dropped(streams=(1,)), Black(streams=(1,)))
-    assert (len(stamps(source, 0)), len(stamps(source, 1))) == (_N, 0)
-    assert black(source) == []
-
-
 def test_depth_does_not_become_black() -> None:
     source = FaultySource(Small("rgbd"), Black())
     assert (black(source), black(source, 1)) == ([*range(_N)], [])
-
-
-def test_images_are_spoilt_as_they_are_loaded_and_not_before() -> None:
-    sound = Small()
-    images = list(FaultySource(sound, Black()).images())
-    assert sound.loaded == []
-    images[3].load()
-    assert sound.loaded == [(1, 1)]
 
 
 def test_faults_number_the_frames_as_in_the_recording_that_they_are_put_into() -> None:

@@ -36,8 +36,7 @@ def configure(kind: str = "klt") -> Config:
     return Config.model_validate({"frontend": {"kind": kind}, "klt": {"n_corners": 300}})
 
 
-@pytest.mark.parametrize("kind", ["descriptor", "klt"])
-@pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
+@pytest.mark.parametrize(("kind", "sensor"), [("descriptor", "stereo"), ("klt", "rgbd")])
 def test_the_front_ends_of_the_project_keep_the_contract(kind: str, sensor: Sensor) -> None:
     check_frontend(make_frontend(recording(sensor).info.camera, configure(kind)), frames(sensor))
 
@@ -210,17 +209,12 @@ def recognize_elsewhere(frontend: KltFrontend, *places: Any) -> Result:
         (spoil_pose(se3.invert), "maps the current frame to the reference"),
         (spoil_pose(offset), "with itself and the identity disagree"),
         (spoil_pose(scaled), "holds no rotation"),
-        (spoil_pose(lambda T: T.astype(np.float32)), "no array of float64"),
-        (spoil_pose(lambda T: np.full_like(T, np.nan)), "not finite"),
         (spoil_pose(lambda T: noisy(T, np.random.default_rng())), "gives another result"),
-        (spoil_covariance(lambda C: C[:3, :3]), r"shape \(6, 6\)"),
         (spoil_covariance(lambda C: -C), "not positive definite"),
         (spoil_covariance(lopsided), "not symmetric"),
-        (spoil_covariance(lambda C: 1e-6 * C), "disagree by"),
         (spoil_found(lambda _: None), "must return RelativePose or Failure, got NoneType"),
         (spoil_found(lambda _: Failure(reason="no idea")), "fails on consecutive.*: no idea"),
         (believing("T_recent"), "^register.* a recent median motion disagree by"),
-        (changing("T_recent"), "^register.* changes its argument prior"),
         (Spoilt(fail_with_the_recent_motion), "^register.* fails with a recent median.*: odd"),
         (spoil_failure(find_the_recent_motion), "are registered"),
         (ChangesTheFrame(), "extract changes the frame"),
@@ -230,13 +224,6 @@ def recognize_elsewhere(frontend: KltFrontend, *places: Any) -> Result:
         (changing("T_predicted"), "changes its argument prior"),
         (ChangesObservations(), "changes its argument"),
         (spoil_failure(raise_on_nothing), "raise IndexError: no matches"),
-        (
-            spoil_failure(
-                lambda _: RelativePose(T_reference_current=np.eye(4), covariance=np.eye(6))
-            ),
-            "are registered",
-        ),
-        (spoil_failure(lambda _: Failure(reason=" ")), "gives no reason"),
     ],
 )
 def test_a_fault_of_a_front_end_is_found(frontend: Any, reason: str) -> None:
@@ -248,11 +235,6 @@ def test_a_fault_of_a_front_end_is_found(frontend: Any, reason: str) -> None:
     with pytest.raises(ContractError, match=reason) as caught:
         check_frontend(frontend, own)
     assert "\n" not in str(caught.value)
-
-
-def test_two_frames_are_too_few() -> None:
-    with pytest.raises(ValueError, match="at least three frames, got 2"):
-        check_frontend(spoil_pose(offset), frames("stereo")[:2])
 
 
 @dataclass(frozen=True)

@@ -40,14 +40,12 @@ from tests.make.tracked import (
     N_FRAMES,
     SECOND_NS,
     START_NS,
-    T_BASE_CAM,
     Tracked,
     by_stamp,
     moved,
     tracked,
 )
 
-_KINDS = pytest.mark.parametrize("name", ["run.mcap", "run.bag"])
 _ESTIMATES = ("raw", "causal", "smoothed")
 _Messages = dict[str, list[tuple[int, Any]]]
 """Log times in nanoseconds and messages, by topic."""
@@ -73,10 +71,9 @@ class _Bag:
     scope="module",
     params=[
         ("stereo", "run.mcap", MOUNTED),
-        ("rgbd", "run.bag", RunFrames()),
-        ("stereo", "run.bag", RunFrames(world="odom", is_world_optical=True)),
+        ("rgbd", "run.bag", RunFrames(world="odom", is_world_optical=True)),
     ],
-    ids=["base", "camera", "above"],
+    ids=["base", "camera"],
 )
 def bag(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> _Bag:
     sensor, name, names = request.param
@@ -262,24 +259,10 @@ def test_tf_holds_the_poses_and_a_camera_hangs_on_each(bag: _Bag) -> None:
         np.testing.assert_array_equal([ahead, left, up], np.eye(3, 4))
 
 
-def test_a_camera_moving_on_the_robot_is_placed_anew(tmp_path: Path) -> None:
-    def mount(stamp_ns: int) -> FloatArray:
-        return T_BASE_CAM @ moved(z=1e-9 * (stamp_ns - START_NS))
-
-    stamps = [START_NS + k * SECOND_NS for k in range(3)]
-    with RunBag(tmp_path / "run.mcap", RunFrames(base="base_link", T_base_cam=mount)) as file:
-        poses = [_add(file, stamp_ns) for stamp_ns in stamps]
-    buffer = _buffer(read_bag(tmp_path / "run.mcap"))
-    for stamp_ns, pose in zip(stamps, poses, strict=True):
-        T_world_cam = _lookup(buffer, "world", "gvo/causal/camera_optical", stamp_ns)
-        np.testing.assert_allclose(T_world_cam, pose.T_world_frame @ mount(stamp_ns), atol=1e-12)
-
-
-@pytest.mark.parametrize("names", [RunFrames(), MOUNTED], ids=["camera", "base"])
 def test_the_frame_of_rep_105_never_jumps_and_its_correction_leads_to_the_corrected_pose(
-    tmp_path: Path, names: RunFrames
+    tmp_path: Path,
 ) -> None:
-    stamps = [START_NS + k * SECOND_NS for k in range(5)]
+    names, stamps = MOUNTED, [START_NS + k * SECOND_NS for k in range(5)]
     rng = np.random.default_rng(1)
     steps = [np.eye(4), *(np.asarray(expm(_hat(rng.normal(0.0, 0.1, 6)))) for _ in stamps[1:])]
     T_map_world = np.asarray(expm(_hat(rng.normal(0.0, 1.0, 6))))  # of loops, from some frame on
@@ -384,20 +367,6 @@ def test_the_covariance_of_a_measured_velocity_is_that_of_the_registration(bag: 
             np.testing.assert_array_equal(message.twist.covariance, -np.eye(6).ravel())
 
 
-def test_a_registration_that_the_window_refused_is_not_the_velocitys_in_odom(
-    tmp_path: Path,
-) -> None:
-    with RunBag(tmp_path / "run.mcap") as file:
-        for k, status in enumerate([Status.OK, Status.OK, Status.COASTING]):
-            frame, result = _made_up(START_NS + k * SECOND_NS)
-            causal = replace(result.causal, status=status)
-            file.add_frame(frame, replace(result, causal=causal, T_previous_frame=np.eye(4)))
-    messages = read_bag(tmp_path / "run.mcap")
-    for kind, expected in (("raw", [-1, 1, 1]), ("odom", [-1, 1, -1])):
-        odometry = messages[f"/gvo/{kind}/odometry"]
-        assert [message.twist.covariance[0] for _, message in odometry] == expected
-
-
 def test_points_are_those_matched_in_grey(bag: _Bag) -> None:
     clouds = bag.messages["/gvo/points"]
     assert sum(cloud.width for _, cloud in clouds) > 50 * len(clouds)
@@ -438,16 +407,6 @@ def test_pictures_and_diagnostics_are_those_of_the_frame(bag: _Bag) -> None:
             assert float(values[f"{stage} [ms]"]) == pytest.approx(ms, abs=1e-3)
 
 
-def test_paths_end_with_all_poses(bag: _Bag) -> None:
-    for kind in ("raw", "smoothed"):
-        poses, (_, path) = bag.poses[kind], bag.messages[f"/gvo/{kind}/path"][-1]
-        assert path.header.frame_id == bag.names.world
-        assert [_stamp_ns(p.header) for p in path.poses] == sorted(poses)
-        for pose, stamp_ns in zip(path.poses, sorted(poses), strict=True):
-            T = _pose_matrix(pose.pose.position, pose.pose.orientation)
-            np.testing.assert_allclose(T, poses[stamp_ns].T_world_frame, atol=1e-12)
-
-
 def _made_up(stamp_ns: int, status: Status = Status.OK) -> tuple[Frame, FrameResult]:
     """Return a small frame and a pose ten metres a second ahead."""
     T = np.eye(4)
@@ -470,7 +429,7 @@ def _add(file: RunBag, stamp_ns: int, status: Status = Status.OK, **changes: Any
 
 
 def test_paths_on_the_way_come_once_a_second_and_stay_short(tmp_path: Path) -> None:
-    n_seconds, rate = 70, 10
+    n_seconds, rate = 60, 10
     stamps = [START_NS + k * SECOND_NS // rate for k in range(n_seconds * rate)]
     with RunBag(tmp_path / "run.mcap") as file:
         # Smoothed poses come late, in pairs, the later one first.
@@ -512,27 +471,25 @@ def test_frames_without_a_registration_are_told_and_have_no_points(tmp_path: Pat
     assert [message.twist.covariance[0] for _, message in odometry] == [-1, -1, -1, -1, 1]
 
 
-@_KINDS
-def test_an_interrupted_run_leaves_what_was_computed(tmp_path: Path, name: str) -> None:
+def test_an_interrupted_run_leaves_what_was_computed(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "run.bag"
+
     def run_until_interrupted() -> None:
-        with RunBag(tmp_path / "new" / name) as file:
+        with RunBag(path) as file:
             file.add_smoothed([_add(file, START_NS)])
             _add(file, START_NS + 1)
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         run_until_interrupted()
-    messages = read_bag(tmp_path / "new" / name)
+    messages = read_bag(path)
     assert len(messages["/gvo/raw/odometry"]) == 2
     assert len(messages["/gvo/raw/path"][-1][1].poses) == 2
     assert len(messages["/gvo/smoothed/path"][-1][1].poses) == 1
 
 
-@_KINDS
-def test_without_a_frame_no_file_is_left_and_closing_twice_does_no_harm(
-    tmp_path: Path, name: str
-) -> None:
-    with RunBag(tmp_path / name) as file:
+def test_without_a_frame_no_file_is_left_and_closing_twice_does_no_harm(tmp_path: Path) -> None:
+    with RunBag(tmp_path / "run.mcap") as file:
         assert len(list(tmp_path.iterdir())) == 1
         file.close()
     assert list(tmp_path.iterdir()) == []
@@ -557,19 +514,18 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
     assert taken.read_text() == "mine"
 
 
-@_KINDS
 def test_a_full_disk_ends_the_run_with_one_line(
-    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file = RunBag(tmp_path / name)
+    file = RunBag(tmp_path / "run.mcap")
     _add(file, START_NS)
 
     def refuse(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(BagWriter, "write", refuse)
-    with pytest.raises(RecordingError, match=f"{name}: cannot be written: No space left"):
+    with pytest.raises(RecordingError, match=r"run\.mcap: cannot be written: No space left"):
         _add(file, START_NS + 1)
-    with pytest.raises(RecordingError, match=f"{name}: cannot be written: No space left"):
+    with pytest.raises(RecordingError, match=r"run\.mcap: cannot be written: No space left"):
         file.close()
     assert list(tmp_path.iterdir()) == []

@@ -25,12 +25,3 @@ def test_a_world_without_a_name_and_a_frame_apart_from_itself_are_refused() -> N
     moved[0, 3] = 0.1
     with pytest.raises(ValueError, match="left: its transform to itself"):
         RunFrames(camera="left", base="/left", T_base_cam=moved)
-
-
-def test_the_mount_cannot_be_changed_from_outside() -> None:
-    T = np.eye(4)
-    names = RunFrames(base="base_link", T_base_cam=T)
-    T[0, 3] = 7.0
-    np.testing.assert_array_equal(names.mount(0), np.eye(4))
-    with pytest.raises(ValueError, match="read-only"):
-        names.mount(0)[0, 3] = 7.0

@@ -9,8 +9,7 @@ import gvo
 from gvo.errors import ConfigurationError
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.runs.outputs.options import name_frames
-from tests.conftest import run_of
-from tests.make.rendered_walk import CAMERA, T_BASE_CAM, Walk
+from tests.make.rendered_walk import CAMERA, T_BASE_CAM
 
 
 def test_the_bag_of_a_run_names_the_frames_of_the_recording(walk_bag: Path) -> None:
@@ -33,8 +32,3 @@ def test_the_bag_of_a_run_names_the_frames_of_the_recording(walk_bag: Path) -> N
 def test_plots_without_a_report_are_refused() -> None:
     with pytest.raises(ConfigurationError, match="--no-report"):
         gvo.RunOutputs(report=False, plots=Path("plots"))
-
-
-def test_without_a_report_nothing_is_drawn(tmp_path: Path) -> None:
-    run_of(Walk(), tmp_path)
-    assert {path.suffix for path in tmp_path.iterdir()} == {".txt", ".csv", ".json", ".g2o"}

@@ -3,13 +3,11 @@
 import csv
 import resource
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -32,7 +30,6 @@ from gvo.runs.outputs.rerun import RunRerun
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import (
-    Estimate,
     FaultyFrame,
     FloatArray,
     FrameResult,
@@ -201,74 +198,6 @@ def test_poses_and_paths_are_those_of_the_run_folder(any_run: _Run, name: str) -
     np.testing.assert_allclose(path, trajectory.positions, atol=2e-6)
 
 
-@pytest.mark.parametrize("name", ["raw", "causal"])
-def test_ellipsoids_are_three_sigma_of_the_position_in_the_world(any_run: _Run, name: str) -> None:
-    rows = any_run.read.rows[f"/world/{name}/covariance"]
-    assert len(rows) == N_FRAMES
-    for row, result in zip(rows, any_run.results, strict=True):
-        _check_ellipsoid(row.values, 0, getattr(result, name))
-
-
-def _check_ellipsoid(values: dict[str, Any], k: int, estimate: Estimate) -> None:
-    """Put the matrix of the ellipsoid together again and compare it with the covariance."""
-    R = estimate.T_world_frame[:3, :3]
-    covariance = R @ estimate.covariance[3:, 3:] @ R.T
-    directions = Rotation.from_quat(values["Ellipsoids3D:quaternions"][k]).as_matrix()
-    sigmas = np.array(values["Ellipsoids3D:half_sizes"][k]) / 3.0
-    scale = max(float(np.abs(covariance).max()), 1e-12)
-    drawn = directions @ np.diag(sigmas**2) @ directions.T
-    np.testing.assert_allclose(drawn, covariance, atol=1e-5 * scale)
-    centre = values["Ellipsoids3D:centers"][k]
-    np.testing.assert_allclose(centre, estimate.T_world_frame[:3, 3], atol=2e-6)
-
-
-def test_keyframes_stand_where_their_causal_poses_put_them(any_run: _Run) -> None:
-    causal = {result.stamp_ns: result.causal for result in any_run.results}
-    pairs = zip(any_run.read.rows["/world/keyframes"], any_run.results, strict=True)
-    for row, result in pairs:
-        expected = [causal[ns].T_world_frame[:3, 3] for ns in result.keyframes_ns]
-        np.testing.assert_allclose(row.values["Points3D:positions"], expected, atol=2e-6)
-        ellipsoids = any_run.read.latest("/world/keyframes/covariance", row.frame)
-        for k, stamp_ns in enumerate(result.keyframes_ns):
-            _check_ellipsoid(ellipsoids, k, causal[stamp_ns])
-    assert max(len(result.keyframes_ns) for result in any_run.results) > 1
-
-
-def test_links_run_from_the_earlier_frame_to_the_newest(any_run: _Run) -> None:
-    causal = any_run.causal()
-    expected: dict[int, list[FloatArray]] = {stamp_ns: [] for stamp_ns in causal}
-    for edge in any_run.table("edges.csv"):
-        stamps_ns = [int(edge["reference_ns"]), int(edge["stamp_ns"])]
-        expected[stamps_ns[1]].append(np.stack([causal[ns][:3, 3] for ns in stamps_ns]))
-    drawn = {row.stamp_ns: row.values for row in any_run.read.rows["/world/links"]}
-    assert drawn.keys() == expected.keys()
-    for stamp_ns, segments in expected.items():
-        strips = drawn[stamp_ns]["LineStrips3D:strips"] or []
-        assert len(strips) == len(segments)
-        drawn_ends, ends = np.reshape(strips, (-1, 3)), np.reshape(segments, (-1, 3))
-        np.testing.assert_allclose(drawn_ends, ends, atol=2e-6)
-    assert sum(map(len, expected.values())) > N_FRAMES
-
-
-def test_there_are_an_image_and_an_overlay_of_each_frame(any_run: _Run) -> None:
-    shapes = {}
-    for entity in ("/overlay", f"{_CAMERA_ENTITY}/image"):
-        rows = any_run.read.rows[entity]
-        assert [row.frame for row in rows] == list(range(N_FRAMES))
-        pictures = [_decode(row.values) for row in rows]
-        assert len({picture.shape for picture in pictures}) == 1
-        assert all(float(picture.std()) > 5.0 for picture in pictures)
-        shapes[entity] = pictures[0].shape[:2]
-    width, height = any_run.read.fixed[f"{_CAMERA_ENTITY}/image"]["Pinhole:resolution"][0]
-    assert shapes[f"{_CAMERA_ENTITY}/image"] == (height, width)
-
-
-def _decode(values: dict[str, Any]) -> Any:
-    (blob,) = values["EncodedImage:blob"]
-    assert values["EncodedImage:media_type"] == ["image/jpeg"]
-    return cv2.imdecode(np.array(blob, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-
-
 def test_matched_points_project_to_where_they_were_seen(any_run: _Run) -> None:
     K = np.array(any_run.read.fixed[f"{_CAMERA_ENTITY}/image"]["Pinhole:image_from_camera"][0])
     rows = any_run.read.rows[f"{_CAMERA_ENTITY}/points"]
@@ -282,24 +211,6 @@ def test_matched_points_project_to_where_they_were_seen(any_run: _Run) -> None:
         np.testing.assert_allclose(pixels, result.registration.pixels_current, atol=0.3)
         colours = set(row.values["Points3D:colors"])
         assert len(colours) == len(set(result.registration.inliers.tolist()))
-
-
-def test_the_cloud_has_the_inliers_of_each_keyframe_in_the_world(any_run: _Run) -> None:
-    causal = any_run.causal()
-    clouds = {row.stamp_ns: row.values for row in any_run.read.rows["/world/cloud"]}
-    n_checked = 0
-    for result in any_run.results:
-        is_keyframe = result.stamp_ns in result.keyframes_ns
-        assert (result.stamp_ns in clouds) == (is_keyframe and result.registration is not None)
-        if result.stamp_ns not in clouds or result.registration is None:
-            continue
-        T_world_cam = causal[result.stamp_ns] @ any_run.frames.mount(0)
-        points = result.registration.points_current[result.registration.inliers]
-        expected = np.column_stack([points, np.ones(len(points))]) @ T_world_cam.T
-        drawn = clouds[result.stamp_ns]["Points3D:positions"]
-        np.testing.assert_allclose(drawn, expected[:, :3], atol=1e-4)
-        n_checked += 1
-    assert n_checked > 0
 
 
 def test_numbers_are_those_of_the_tables_in_the_colours_of_the_report(any_run: _Run) -> None:
@@ -323,25 +234,9 @@ def test_numbers_are_those_of_the_tables_in_the_colours_of_the_report(any_run: _
     assert means
 
 
-def test_the_log_has_the_status_of_each_frame_and_the_configuration(any_run: _Run) -> None:
-    texts = [row.values["TextLog:text"][0] for row in any_run.read.rows["/status"]]
-    statuses = [row["status"] for row in any_run.table("frames.csv")]
-    assert [text.split(":")[0] for text in texts] == statuses
-    assert "n_keyframes" in any_run.read.fixed["/configuration"]["TextDocument:text"][0]
-
-
 def test_up_is_where_the_frame_has_it(room_run: _Run, robot_run: _Run) -> None:
     axes = [run.read.fixed["/world"]["ViewCoordinates:xyz"][0] for run in (room_run, robot_run)]
     assert axes == [_RIGHT_DOWN_FORWARD, _FORWARD_LEFT_UP]
-
-
-@pytest.mark.parametrize(("down", "axes"), [("y", _RIGHT_DOWN_FORWARD), ("z", _FORWARD_LEFT_UP)])
-def test_a_placed_camera_tells_where_up_is(tmp_path: Path, down: str, axes: list[int]) -> None:
-    turn = [-100.0, 0.0, 0.0] if down == "z" else [10.0, 5.0, 0.0]
-    R = np.asarray(Rotation.from_euler("xyz", turn, degrees=True).as_matrix())
-    start = make_transform(R, np.array([4.0, 5.0, 6.0]))
-    read = _write_made(tmp_path, [_made(0, start)], RunFrames())
-    assert read.fixed["/world"]["ViewCoordinates:xyz"][0] == axes
 
 
 def _made(stamp_ns: int, T_world_cam: FloatArray | None = None) -> FrameResult:
@@ -418,17 +313,6 @@ def test_faulty_frames_are_told_and_counted(tmp_path: Path) -> None:
     assert [row[2] for row in rows][::2] == ["skipped: black", "skipped: torn"]
     assert [row.frame for row in read.rows["/world/causal/frame"]] == [1, 3]
     assert [(r.frame, r.stamp_ns) for r in read.rows["/world/smoothed/frame"]] == [(1, 2)]
-
-
-def test_each_frame_may_come_from_another_thread(tmp_path: Path) -> None:
-    path = tmp_path / "made.rrd"
-    with RunRerun(path, _CAMERA) as file:
-        for k in range(6):
-            with ThreadPoolExecutor(1) as pool:
-                pool.submit(file.add_frame, _frame(k), _made(k)).result()
-    rows = _Read(path).rows
-    for entity in ("/overlay", "/world/causal/frame", "/world/links", "/counts/matches"):
-        assert [(row.frame, row.stamp_ns) for row in rows[entity]] == [(k, k) for k in range(6)]
 
 
 def test_a_file_has_its_name_when_it_is_closed_also_of_an_interrupted_run(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from gvo.errors import RecordingError
 from gvo.io.recording import Sensor
 from gvo.io.synthetic import WorldName
 from gvo.runs.outputs.video import RunOverlay, film_width
@@ -69,7 +68,7 @@ def test_faulty_frames_have_dark_pictures_in_their_place(drive: Tracked, tmp_pat
     assert pictures[4].mean() < 0.3 * pictures[5].mean()
 
 
-@pytest.mark.parametrize(("suffix", "n_done"), [(".webm", 7), (".mp4", 1)])
+@pytest.mark.parametrize(("suffix", "n_done"), [(".webm", 3)])
 def test_an_interrupted_run_leaves_a_film_of_what_was_done(
     drive: Tracked, tmp_path: Path, suffix: str, n_done: int
 ) -> None:
@@ -88,29 +87,6 @@ def test_an_interrupted_run_leaves_a_film_of_what_was_done(
     assert len(list(_decoded(path))) == n_done
     output.close()
     assert [entry.name for entry in path.parent.iterdir()] == [path.name]
-
-
-def test_without_a_frame_no_file_is_left(drive: Tracked, tmp_path: Path) -> None:
-    for name in ("film.webm", "frames"):
-        with RunOverlay(tmp_path / name, drive.recording.info.camera):
-            pass
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_frames_become_numbered_files_where_a_folder_is_named(
-    drive: Tracked, tmp_path: Path
-) -> None:
-    camera, pairs = drive.recording.info.camera, drive.pairs()
-    with RunOverlay(tmp_path / "frames", camera) as output:
-        for frame, result in pairs:
-            output.add_frame(frame, result)
-    assert output.decisions == ()
-    files = sorted((tmp_path / "frames").iterdir())
-    assert len(files) == N_FRAMES
-    frame, result = pairs[-1]
-    width = film_width(camera)
-    expected = compose_overlay(frame, result, camera, index=N_FRAMES - 1, max_width=width)
-    np.testing.assert_array_equal(cv2.imread(str(files[-1])), expected)
 
 
 def test_a_loop_is_marked_for_a_second(drive: Tracked, tmp_path: Path) -> None:
@@ -133,17 +109,3 @@ def test_a_loop_is_marked_for_a_second(drive: Tracked, tmp_path: Path) -> None:
         plain = compose_overlay(frame, result, camera, index=n, max_width=film_width(camera))
         is_marked.append(bool(np.any(cv2.imread(str(file)) != plain)))
     assert is_marked == [False, False, True, True, True, False]
-
-
-def test_what_cannot_be_written_is_told_to_the_run(drive: Tracked, tmp_path: Path) -> None:
-    camera, pairs = drive.recording.info.camera, drive.pairs()
-    folder = tmp_path / "frames"
-
-    def run() -> None:
-        with RunOverlay(folder, camera) as output:
-            folder.rmdir()
-            for frame, result in pairs:
-                output.add_frame(frame, result)
-
-    with pytest.raises(RecordingError, match="frames: cannot be written"):
-        run()
