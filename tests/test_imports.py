@@ -65,7 +65,6 @@ def test_nothing_large_is_loaded_before_needed(room_bag: Path, poses: Path, tmp_
     film = tmp_path / "film.webm"
     actions = [
         "from gvo import *",
-        "import gvo.batch; dir(gvo.batch)",
         command("--help"),
         command("batch", "--help"),
         f"track({str(room_bag)!r})",
@@ -80,7 +79,7 @@ def test_nothing_large_is_loaded_before_needed(room_bag: Path, poses: Path, tmp_
 
 def test_batches_and_plots_load_what_they_need_alone(poses: Path, tmp_path: Path) -> None:
     plot = command("compare", poses, poses, "--plot", tmp_path / "plot.png")
-    make = "from gvo.batch import Variant, make_variants; make_variants()"
+    make = "from gvo.batch import make_variants; make_variants()"
     (code, loaded), plotted = loaded_by(make, plot)
     assert code == 0
     assert isinstance(loaded, list)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from gvo._text import cut, number_text
+from gvo.batch.results import outcome
 from gvo.io.run_folder.writer import REPORT
 from gvo.viz.figures import WIDE, Plot, new_figure, plain, style
 from gvo.viz.pages import write_page
@@ -83,21 +83,19 @@ def _compared(table: pd.DataFrame) -> pd.DataFrame:
 
 def _reasons(table: pd.DataFrame) -> list[str]:
     """Return why runs failed, the commonest reason first."""
-    reasons = Counter(table["reason"][table["status"] == "failed"])
-    lines = [f"{n} x {reason}" for reason, n in reasons.most_common(_MAX_REASONS)]
+    reasons = table["reason"][table["status"] == "failed"].value_counts()
+    lines = [f"{n} x {reason}" for reason, n in reasons[:_MAX_REASONS].items()]
     n_others = len(reasons) - len(lines)
     return [*lines, f"{n_others} other reasons: see the table"] if n_others else lines
 
 
 def _facts(table: pd.DataFrame) -> dict[str, str]:
-    counts = Counter(table["status"])
-    statuses = ", ".join(f"{counts[status]} {status}" for status in reversed(_RANKS))
     seconds = table["run_s"].sum()
     return {
         "Recordings": str(table["recording"].nunique()),
         "Configurations": str(table["variant"].nunique()),
         "Swept": ", ".join(name for name in table.columns if "." in name),
-        "Runs": f"{len(table)}: {statuses}",
+        "Runs": f"{len(table)}: {outcome(table)[0]}",
         "Found finished": str(table["is_found"].sum() or ""),
         "Frames": str(table["frames"].sum()),
         "Time of all runs": f"{seconds:.0f} s" if seconds else "",
@@ -143,46 +141,26 @@ def _box_plots(table: pd.DataFrame, rows: str) -> Plot:
 
 
 def _draw_boxes(axes: Axes, values: Sequence[Any], *, colour: str) -> None:
+    line = {"color": colour}
+    lines = {f"{part}props": line for part in ("box", "whisker", "cap", "median")}
     for y, each in enumerate(values):
         if len(each) > 2:
-            line = {"color": colour}
-            axes.boxplot(
-                each,
-                positions=[y],
-                orientation="horizontal",
-                widths=0.6,
-                showfliers=False,
-                manage_ticks=False,
-                boxprops=line,
-                whiskerprops=line,
-                capprops=line,
-                medianprops=line,
-            )
+            options: dict[str, Any] = {"orientation": "horizontal", "widths": 0.6, **lines}
+            axes.boxplot(each, positions=[y], showfliers=False, manage_ticks=False, **options)
         axes.plot(each, np.full(len(each), y), "o", color=colour, ms=3.5, alpha=0.7)
 
 
 def _medians(table: pd.DataFrame) -> tuple[list[str], list[list[str]]]:
     """Return header and rows of the medians of each configuration, the most accurate first."""
-    groups = table.groupby("variant", sort=False)
-    medians = (
-        groups[[_RELATIVE, _TIME]]
-        .median()
-        .assign(
-            compared=groups[_RELATIVE].count(),
-            failed=groups["status"].agg(lambda status: (status == "failed").sum()),
-        )
-    )
-    rows = [
-        [
-            str(name),
-            number_text(row[_RELATIVE], ".3f"),
-            number_text(row[_TIME], ".1f"),
-            f"{row['compared']:.0f}",
-            f"{row['failed']:.0f}",
-        ]
-        for name, row in medians.sort_values(_RELATIVE).iterrows()
-    ]
-    return ["configuration", _RELATIVE, "frame [ms]", "compared runs", "failed runs"], rows
+    rows = []
+    for name, runs in table.groupby("variant", sort=False):
+        error, frame_ms = runs[_RELATIVE].median(), runs[_TIME].median()
+        n_compared, n_failed = runs[_RELATIVE].count(), (runs["status"] == "failed").sum()
+        texts = [str(name), number_text(error, ".3f"), number_text(frame_ms, ".1f")]
+        rows.append((error, [*texts, str(n_compared), str(n_failed)]))
+    rows.sort(key=lambda row: (np.isnan(row[0]), row[0]))
+    header = ["configuration", _RELATIVE, "frame [ms]", "compared runs", "failed runs"]
+    return header, [texts for _, texts in rows]
 
 
 def _known_columns(table: pd.DataFrame) -> dict[str, str]:

@@ -36,12 +36,12 @@ def to_frame(rows: Sequence[BatchRow]) -> pd.DataFrame:
     return frame
 
 
-def outcome(table: pd.DataFrame) -> tuple[dict[str, int], list[str]]:
-    """Return the number of runs of each status that occurs, and why runs are not complete."""
-    counts = {status: int((table["status"] == status).sum()) for status in get_args(RunStatus)}
+def outcome(table: pd.DataFrame) -> tuple[str, list[str]]:
+    """Return as text how many runs have which status, and why each is not complete."""
+    counts = [(int((table["status"] == status).sum()), status) for status in get_args(RunStatus)]
     unfinished = table[table["status"] != "complete"]
     reasons = [f"{row.folder}: {row.status}: {row.reason}" for row in unfinished.itertuples()]
-    return {status: n for status, n in counts.items() if n}, reasons
+    return ", ".join(f"{n} {status}" for n, status in counts if n), reasons
 
 
 def write_results(frame: pd.DataFrame, folder: Path) -> None:

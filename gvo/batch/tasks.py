@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping
@@ -22,7 +21,7 @@ from gvo.io.run_folder.reader import MAX_SUMMARY_BYTES
 from gvo.io.run_folder.writer import SUMMARY
 from gvo.runs.outputs.options import RunOutputs
 from gvo.runs.run import RunResult, run_recording
-from gvo.runs.summary import run_identity
+from gvo.runs.summary import digest, run_identity
 from gvo.types import Progress
 
 # A value of a parameter, as YAML gives it.
@@ -184,7 +183,7 @@ class Task:
             folder=self.folder,
             parameters=self.parameters,
             gvo_version=__version__,
-            configuration_hash=_digest(self.config.model_dump(mode="json")),
+            configuration_hash=digest(self.config.model_dump(mode="json")),
         )
 
 
@@ -207,13 +206,8 @@ def run_task(
         **_measures_of(result.summary),
         run_s=None if is_found else time.perf_counter() - start,
         is_found=is_found,
-        run_hash=_digest([result.summary["run"], result.summary["configuration"]]),
+        run_hash=digest([result.summary["run"], result.summary["configuration"]]),
     )
-
-
-def _digest(values: object) -> str:
-    text = json.dumps(values, sort_keys=True, default=str)
-    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
 def _check_worker(options: TaskOptions) -> None:

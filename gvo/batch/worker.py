@@ -5,15 +5,13 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from distributed import get_worker
 
+from gvo.batch.tasks import BatchRow, Task, TaskOptions, run_task
 from gvo.errors import GvoError
-
-if TYPE_CHECKING:
-    from gvo.batch.tasks import BatchRow, Task, TaskOptions
-    from gvo.types import Progress
+from gvo.types import Progress
 
 _LOOK_EVERY_S = 1.0
 
@@ -34,8 +32,6 @@ def dask_setup(worker: object) -> None:
 
 def work(task: Task, options: TaskOptions, key: Any) -> BatchRow:  # noqa: ANN401
     """Run a task on this worker; `key` is its key on the scheduler."""
-    from gvo.batch.tasks import run_task
-
     return run_task(task, options, on_progress=_stopper(get_worker(), key))
 
 

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer import Argument, Option
 
 from gvo.cli import options as opt
-from gvo.cli.terminal import exit_code, interruptible_run, is_shown, say, warn
+from gvo.cli.terminal import exit_code, interruptible_run, is_shown, say, status, warn
 from gvo.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -60,6 +60,7 @@ def batch(
     from gvo.batch.results import outcome
     from gvo.batch.running import check_place, make_tasks
     from gvo.io.calibration.files import paths_of
+    from gvo.io.run_folder.writer import REPORT
 
     if scheduler is not None and workers is not None:
         raise ConfigurationError("--workers starts processes here, --scheduler names a cluster")
@@ -85,7 +86,14 @@ def batch(
         table = run_batch(
             found, variants, out=out, client=client, options=batch_options, on_progress=progress
         )
-    _report(*outcome(table), out)
+    words, reasons = outcome(table)
+    warn(reasons[:_MAX_WARNINGS])
+    if len(reasons) > _MAX_WARNINGS:
+        warn([f"{len(reasons) - _MAX_WARNINGS} more runs are not complete, see the table"])
+    say(f"{_count(len(table), 'run')}: {words}; {out / REPORT}")
+    if (table["status"] == "failed").all():
+        raise ConfigurationError("all runs failed")
+    raise typer.Exit(exit_code(not reasons))
 
 
 def _sort_arguments(recordings: list[str], configs: list[str]) -> tuple[list[str], list[Path]]:
@@ -110,11 +118,8 @@ def _progress() -> Iterator[Callable[[BatchProgress], None]]:
     if not is_shown():
         yield _print_row
         return
-    from rich.console import Console
-    from rich.status import Status
-
-    with Status("waiting for workers", console=Console(stderr=True)) as status:
-        yield lambda progress: status.update(_words(progress))
+    with status("batch") as show:
+        yield lambda progress: show(_words(progress))
 
 
 def _print_row(progress: BatchProgress) -> None:
@@ -126,7 +131,8 @@ def _print_row(progress: BatchProgress) -> None:
 
 
 def _words(progress: BatchProgress) -> str:
-    left = "" if progress.left_s is None else f", {_clock(progress.left_s)} left"
+    left_s = progress.left_s
+    left = "" if left_s is None else f", {timedelta(seconds=round(left_s))} left"
     return (
         f"{progress.n_done} of {progress.n_total} runs, {progress.n_failed} failed, on "
         f"{progress.n_workers} workers{left}"
@@ -135,22 +141,3 @@ def _words(progress: BatchProgress) -> str:
 
 def _count(number: int, what: str) -> str:
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
-
-
-def _clock(seconds: float) -> str:
-    return time.strftime("%H:%M:%S" if seconds >= 3600 else "%M:%S", time.gmtime(seconds))
-
-
-def _report(counts: Mapping[str, int], reasons: list[str], out: Path) -> NoReturn:
-    """Print the outcome of a batch, and end with its exit code."""
-    from gvo.io.run_folder.writer import REPORT
-
-    warn(reasons[:_MAX_WARNINGS])
-    if len(reasons) > _MAX_WARNINGS:
-        warn([f"{len(reasons) - _MAX_WARNINGS} more runs are not complete, see the table"])
-    words = ", ".join(f"{n} {status}" for status, n in counts.items())
-    n_runs = sum(counts.values())
-    say(f"{_count(n_runs, 'run')}: {words}; {out / REPORT}")
-    if counts.get("failed") == n_runs:
-        raise ConfigurationError("all runs failed")
-    raise typer.Exit(exit_code(not reasons))

@@ -152,7 +152,10 @@ def smooth_edges(
             for event in _events(source, notes):
                 smoother.take(event)
                 if on_progress is not None:
-                    on_progress(_progress(smoother, source.n_poses))
+                    n_done = smoother.n_poses
+                    n_total = max(source.n_poses, n_done)
+                    tracked = smoother.n_tracked
+                    on_progress(Progress(n_done=n_done, n_total=n_total, n_tracked=tracked))
     notes.warnings += source.faults.warnings()
     return _conclude(smoother, _with_stamps(ground_truth, source, folder), on_written)
 
@@ -220,11 +223,6 @@ def _events(source: EdgeSource, notes: SmoothingNotes) -> Iterator[Event]:
         notes.broken_off = str(error)
 
 
-def _progress(smoother: Smoother, n_total: int) -> Progress:
-    n_done = smoother.n_poses
-    return Progress(n_done=n_done, n_total=max(n_total, n_done), n_tracked=smoother.n_tracked)
-
-
 def _with_stamps(
     truth: Trajectory | None, source: EdgeSource, folder: RunFolder
 ) -> Trajectory | None:
@@ -270,7 +268,12 @@ def _written(
     on_written: Callable[[], None] | None,
 ) -> RunResult:
     """Compare with the truth; write the summary and the picture."""
-    evaluations = _compare(truth, estimates, notes)
+    evaluations: tuple[Evaluation, ...] = ()
+    if truth is not None:
+        try:
+            evaluations = tuple(evaluate(truth, e, name=name) for name, e in estimates.items())
+        except GvoError as error:
+            notes.warnings.append(f"not compared with the ground truth: {error}")
     if notes.broken_off:
         cut = f"the input broke off after {summary['frames']} poses: {notes.broken_off}"
         warnings = [cut, *warnings]
@@ -288,19 +291,6 @@ def _written(
     return RunResult(
         summary=summary, evaluations=evaluations, is_complete=is_complete, warnings=tuple(warnings)
     )
-
-
-def _compare(
-    truth: Trajectory | None, estimates: dict[str, Trajectory], notes: SmoothingNotes
-) -> tuple[Evaluation, ...]:
-    """Return the errors; if they cannot be computed, add a warning to the notes."""
-    if truth is None:
-        return ()
-    try:
-        return tuple(evaluate(truth, e, name=name) for name, e in estimates.items())
-    except GvoError as error:
-        notes.warnings.append(f"not compared with the ground truth: {error}")
-        return ()
 
 
 def _warnings(smoother: Smoother) -> Iterator[str]:
@@ -321,15 +311,21 @@ def _warnings(smoother: Smoother) -> Iterator[str]:
 
 def _summary(smoother: Smoother) -> dict[str, Any]:
     batch_result = smoother.window.batch_result
-    return {
-        "gvo_version": __version__,
-        "recording": smoother.notes.recording,
-        "decisions": smoother.notes.decisions,
-        "frames": smoother.n_poses,
-        "tracked": smoother.n_tracked,
+    return _counted(smoother.notes, smoother.n_poses, smoother.n_tracked) | {
         "status_counts": {status.value: smoother.statuses[status] for status in Status},
         "window": asdict(smoother.window.counts),
         "batch": None if batch_result is None else batch_result.as_json(),
+    }
+
+
+def _counted(notes: SmoothingNotes, n_poses: int, n_tracked: int) -> dict[str, Any]:
+    """Return what all summaries hold."""
+    return {
+        "gvo_version": __version__,
+        "recording": notes.recording,
+        "decisions": notes.decisions,
+        "frames": n_poses,
+        "tracked": n_tracked,
         "peak_memory_mb": round(peak_memory_mb(), 1),
     }
 
@@ -489,16 +485,10 @@ def optimize_edges(
 def _batch_summary(
     graph: WholeGraph, optimizer: BatchOptimizer, robust: Robust, notes: SmoothingNotes
 ) -> dict[str, Any]:
-    return {
-        "gvo_version": __version__,
-        "recording": notes.recording,
-        "decisions": notes.decisions,
-        "frames": len(graph.frame_ids),
-        "tracked": len(optimizer.numbers),
+    return _counted(notes, len(graph.frame_ids), len(optimizer.numbers)) | {
         "edges": len(graph.links),
         "robust": robust,
         "batch": optimizer.as_json(),
-        "peak_memory_mb": round(peak_memory_mb(), 1),
     }
 
 
@@ -609,34 +599,30 @@ def _answer_all(
 
 
 def _reply(request: Request, smoother: Smoother) -> str:
-    frame_id = request.frame_id
-    if frame_id not in smoother.window:
-        estimate, rejected = _add(request, smoother), list[Rejected]()
+    """Add a new pose, or edges and prior to one of the window; return its estimate as a line."""
+    frame_id, window, rejected = request.frame_id, smoother.window, list[Rejected]()
+    if frame_id in window:
+        rejected = _extend(request, window)
+        estimate = window.estimate(frame_id)
+    elif request.stamp_ns is None:
+        raise ValueError(f"{frame_id!r} is not in the window; a new pose needs a stamp")
     else:
-        estimate, rejected = _extend(request, smoother)
-    if request.keep is not None and frame_id in smoother.window:
-        (smoother.window.keep if request.keep else smoother.window.release)(frame_id)
+        edges, prior, stamp_ns = request.edges, request.prior, request.stamp_ns
+        event = PoseEvent(frame_id=frame_id, stamp_ns=stamp_ns, edges=edges, prior=prior)
+        estimate = smoother.add_pose(event)
+    if request.keep is not None and frame_id in window:
+        (window.keep if request.keep else window.release)(frame_id)
     return format_estimate(estimate, rejected)
 
 
-def _add(request: Request, smoother: Smoother) -> Estimate:
-    if request.stamp_ns is None:
-        raise ValueError(f"{request.frame_id!r} is not in the window; a new pose needs a stamp")
-    frame_id, edges, prior = request.frame_id, request.edges, request.prior
-    event = PoseEvent(frame_id=frame_id, stamp_ns=request.stamp_ns, edges=edges, prior=prior)
-    return smoother.add_pose(event)
-
-
-def _extend(request: Request, smoother: Smoother) -> tuple[Estimate, list[Rejected]]:
-    """Add edges and prior to a pose of the window; return its estimate and what was refused."""
-    frame_id, window = request.frame_id, smoother.window
-    if request.stamp_ns not in (None, window.stamp_ns(frame_id)):
+def _extend(request: Request, window: SlidingWindow) -> list[Rejected]:
+    """Add edges and prior to a pose of the window; return what was refused."""
+    frame_id, stamp_ns = request.frame_id, window.stamp_ns(request.frame_id)
+    if request.stamp_ns not in (None, stamp_ns):
         raise ValueError(
-            f"{frame_id!r} is in the window with the stamp {window.stamp_ns(frame_id)}, got "
-            f"{request.stamp_ns}"
+            f"{frame_id!r} is in the window with the stamp {stamp_ns}, got {request.stamp_ns}"
         )
     answers: list[Estimate | Rejected] = [window.add_edge(frame_id, edge) for edge in request.edges]
     if request.prior is not None:
         answers.append(window.add_prior(frame_id, request.prior))
-    rejected = [reply for reply in answers if isinstance(reply, Rejected)]
-    return window.estimate(frame_id), rejected
+    return [reply for reply in answers if isinstance(reply, Rejected)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
@@ -14,28 +15,10 @@ from gvo.backend.gating import WindowCounts
 from gvo.frontend.calibration import RigOffsets
 from gvo.types import FaultyFrame, FrameResult, Progress, SegmentJoin, Status
 
-_BIN_WIDTH = 0.01
 # A run with a larger share of untracked poses is not complete.
 _MAX_UNTRACKED_SHARE = 0.1
 # The moving head or arm of a robot displaces its camera by less.
 _MAX_MOUNT_TRAVEL_M = 2.0
-
-
-class _Durations:
-    """A histogram of durations with bins of one percent: constant memory."""
-
-    def __init__(self) -> None:
-        self._counts: Counter[int] = Counter()
-
-    def add(self, elapsed_ms: float) -> None:
-        self._counts[round(np.log(max(elapsed_ms, 1e-3)) / _BIN_WIDTH)] += 1
-
-    def median(self) -> float:
-        """Return the median in milliseconds, right to half a percent."""
-        bins = sorted(self._counts)
-        cumulated = np.cumsum([self._counts[bin_] for bin_ in bins])
-        middle = bins[int(np.searchsorted(cumulated, 0.5 * cumulated[-1]))]
-        return round(float(np.exp(middle * _BIN_WIDTH)), 3)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -66,7 +49,7 @@ class RunStatistics:
     window: WindowCounts = field(default_factory=WindowCounts)
     batch_result: BatchResult | None = None
     rig_offsets: RigOffsets | None = None
-    stages: dict[str, _Durations] = field(default_factory=dict)
+    stages: dict[str, array[float]] = field(default_factory=dict)
     segments: dict[int, Segment] = field(default_factory=dict)
 
     @property
@@ -112,7 +95,9 @@ class RunStatistics:
             "window": asdict(self.window),
             "batch": None if self.batch_result is None else self.batch_result.as_json(),
             "rig_offsets": None if self.rig_offsets is None else self.rig_offsets.as_json(),
-            "median_ms": {name: durations.median() for name, durations in self.stages.items()},
+            "median_ms": {
+                stage: round(float(np.median(elapsed)), 3) for stage, elapsed in self.stages.items()
+            },
         }
 
     @property
@@ -165,7 +150,7 @@ class RunStatistics:
 
     def add_duration(self, stage: str, elapsed_ms: float) -> None:
         """Count the time of one frame in a stage, milliseconds."""
-        self.stages.setdefault(stage, _Durations()).add(elapsed_ms)
+        self.stages.setdefault(stage, array("d")).append(elapsed_ms)
 
     def add_faulty(self, frame: FaultyFrame, *, is_loss: bool) -> None:
         """Count a lost frame, or an image without partner."""

@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import resource
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing, suppress
-from dataclasses import asdict, fields
-from itertools import islice
+from collections.abc import Callable
+from contextlib import AbstractContextManager, suppress
+from dataclasses import asdict
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 from gvo._version import __version__
 from gvo.errors import GvoError, OutputError
-from gvo.geometry.camera import Calibration
 from gvo.io.excerpt import Excerpt
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.poses.truth import TruthComparison
-from gvo.io.recording import RecordingInfo, Source, StampedImage
+from gvo.io.recording import Source
 from gvo.io.run_folder.writer import RunFolder
 from gvo.runs.loop import RunLoop
 from gvo.trajectory.evaluation import evaluations_json
@@ -29,9 +28,6 @@ from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, Optimum, Progress
 
 State: TypeAlias = Literal["running", "interrupted", "complete"]
-
-# Images among which the first of each stream are looked for.
-_N_FIRST = 20
 
 
 def summarize(
@@ -110,7 +106,7 @@ def run_identity(
     Parameters
     ----------
     source : Source
-        The first image of either stream is read.
+        The first image is read.
     base_frame : BaseFrame
         As before the first frame.
     excerpt : Excerpt or None
@@ -124,71 +120,45 @@ def run_identity(
     dict
         Values that are the same after writing and reading JSON.
     """
-    info = source.info
+    info, view = source.info, source.info.depth_view
     return {
         "version of gvo": __version__,
         "recording": {
             "sensor": info.sensor,
             "number of images": info.n_images,
             "frame_id": info.frame_id,
-            "calibration": _digest(_calibration_parts(info)),
-            "first images": {} if is_live else dict(_first_images(source)),
+            "calibration": digest([*map(asdict, info.calibrations), view and asdict(view)]),
+            "first image": "" if is_live else _first_image(source),
         },
         "excerpt": asdict(excerpt or Excerpt()),
         "output": {
             "frame": base_frame.name,
-            "mount": _digest_of(base_frame.fixed_mount),
-            "initial pose": _digest_of(base_frame.T_initial),
-            "true start": "" if start is None else _digest_of(start.T_world_frame),
+            "mount": digest(base_frame.fixed_mount),
+            "initial pose": digest(base_frame.T_initial),
+            "true start": digest(None if start is None else start.T_world_frame),
         },
     }
 
 
-def _calibration_parts(info: RecordingInfo) -> Iterator[bytes]:
-    view = info.depth_view
-    calibrations = [*info.calibrations, *([] if view is None else [view.calibration])]
-    for calibration in calibrations:
-        for field in fields(Calibration):
-            value = getattr(calibration, field.name)
-            yield value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
-    if view is not None:
-        yield view.T_color_depth.tobytes()
+def digest(value: object) -> str:
+    """Return a digest of arrays, numbers and texts, in lists and dictionaries."""
+    text = json.dumps(value, sort_keys=True, default=_plain)
+    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
-def _first_images(source: Source) -> Iterator[tuple[str, str]]:
-    """Yield the stream of the first image of each, its stamp and a digest of its pixels."""
-    streams: set[int] = set()
+def _plain(value: object) -> object:
+    return value.tolist() if isinstance(value, np.ndarray) else str(value)
+
+
+def _first_image(source: Source) -> str:
+    """Return the stamp of the first image, and a digest of its pixels."""
     try:
-        with closing(image for image in source.images()) as images:
-            for image in islice(images, _N_FIRST):
-                if image.stream not in streams:
-                    streams.add(image.stream)
-                    yield source.info.stream_names[image.stream], _describe_image(image)
-                if len(streams) == 2:
-                    return
+        for image in source.images():
+            pixels = hashlib.blake2b(image.load().tobytes(), digest_size=8)
+            return f"{image.stamp_ns} {pixels.hexdigest()}"
     except GvoError:
-        return  # the run itself will say so
-
-
-def _describe_image(image: StampedImage) -> str:
-    try:
-        pixels = image.load()
-    except GvoError:
-        return f"{image.stamp_ns} faulty"
-    parts = f"{pixels.dtype}{pixels.shape}".encode(), np.ascontiguousarray(pixels).tobytes()
-    return f"{image.stamp_ns} {_digest(parts)}"
-
-
-def _digest_of(array: np.ndarray[Any, Any] | None) -> str:
-    return "" if array is None else _digest([np.ascontiguousarray(array).tobytes()])
-
-
-def _digest(parts: Any) -> str:  # noqa: ANN401 - bytes, one after another
-    digest = hashlib.blake2b(digest_size=8)
-    for part in parts:
-        digest.update(len(part).to_bytes(8, "little"))
-        digest.update(part)
-    return digest.hexdigest()
+        return "faulty"  # the run itself will say so
+    return ""
 
 
 _EVERY_S = 3.0

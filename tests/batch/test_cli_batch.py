@@ -259,5 +259,5 @@ def test_on_a_terminal_there_is_one_line(
     answer = batch(bags / "walk0.mcap", "--out", tmp_path)
     assert answer.code == 0
     assert answer.err == ""
-    assert shown[0] == "waiting for workers"
-    assert shown[-1] == "1 of 1 runs, 0 failed, on 1 workers, 00:00 left"
+    assert shown[0] == "batch"
+    assert shown[-1] == "batch: 1 of 1 runs, 0 failed, on 1 workers, 0:00:00 left"

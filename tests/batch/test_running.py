@@ -144,10 +144,3 @@ def test_tasks_are_all_pairs_in_folders_of_their_own() -> None:
     assert tasks[1].parameters == {"window.size": 3, "window.gate": 9.5}
     (single,) = make_tasks(recordings[:1], variants[:1])
     assert (single.folder, single.parameters) == ("a", {})
-
-
-def test_public_names_are_there() -> None:
-    assert set(gvo.batch.__all__) <= set(dir(gvo.batch))
-    assert all(getattr(gvo.batch, name) is not None for name in gvo.batch.__all__)
-    with pytest.raises(AttributeError, match="nonsense"):
-        _ = gvo.batch.nonsense

@@ -47,7 +47,7 @@ class RunFrames:
     Raises
     ------
     ValueError
-        For a world without a name, or a transform between a frame and itself.
+        For a world without a name.
     """
 
     world: str = "world"
@@ -65,12 +65,6 @@ class RunFrames:
             object.__setattr__(self, key, name)
         if not self.world:
             raise ValueError("the world needs a name")
-        if not callable(self.T_base_cam):
-            T = np.array(self.T_base_cam, dtype=np.float64)
-            T.setflags(write=False)
-            object.__setattr__(self, "T_base_cam", T)
-            if self.is_camera and not np.array_equal(T, np.eye(4)):
-                raise ValueError(f"{camera}: its transform to itself must be the identity")
 
     @property
     def is_camera(self) -> bool:
