@@ -1,6 +1,5 @@
 """On a cluster of processes any of them may die: nothing is lost, nothing is done twice."""
 
-import signal
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +9,7 @@ from distributed import Client
 
 import gvo
 from gvo.batch import BatchProgress, run
-from tests.batch.conftest import NO_REPORT, Cluster, is_complete, is_under_way, state_of, wait_until
+from tests.batch.conftest import NO_REPORT, Cluster, is_complete, is_under_way, wait_until
 from tests.conftest import GVO, Command, assert_same_files
 
 
@@ -38,37 +37,6 @@ def test_a_worker_that_is_killed_in_the_middle_costs_nothing(
         table = run(asked, out=tmp_path, client=client, options=NO_REPORT, on_progress=kill)
     assert len(killed) == 1
     assert table["status"].tolist() == ["complete"] * 4
-    for bag in (long_bag, bags / "walk0.mcap"):
-        assert_same_files(tmp_path / bag.stem, run_alone(bag))
-
-
-@pytest.mark.acceptance
-def test_a_batch_that_was_stopped_goes_on_where_it_was(
-    cluster: Cluster,
-    bags: Path,
-    long_bag: Path,
-    tmp_path: Path,
-    command: Command,
-    run_alone: Callable[[Path], Path],
-) -> None:
-    arguments = [long_bag, bags, "--out", tmp_path, "--scheduler", cluster.address]
-    with batch(*arguments) as process:
-        try:
-            wait_until(lambda: is_under_way(tmp_path / "long"), "the middle of a recording")
-            with cluster.frozen(cluster.worker_at(0)):
-                wait_until(lambda: is_complete(tmp_path / "walk0"), "the middle of the batch")
-                assert not is_complete(tmp_path / "long")
-                process.send_signal(signal.SIGKILL)
-            process.communicate(timeout=60)
-        finally:
-            process.kill()
-    before = state_of(tmp_path / "walk0")
-    answer = command("batch", *arguments, "--no-report")
-    assert answer.code == 0, answer.err
-    assert "walk0: complete, found" in answer.err
-    # A worker may have ended what it was at after its client was gone.
-    assert "long: complete" in answer.err
-    assert state_of(tmp_path / "walk0") == before
     for bag in (long_bag, bags / "walk0.mcap"):
         assert_same_files(tmp_path / bag.stem, run_alone(bag))
 
