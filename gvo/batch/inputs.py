@@ -134,26 +134,21 @@ def _is_bag(name: str) -> bool:
 
 
 def _name(locations: Sequence[str]) -> list[NamedRecording]:
-    """Name each by the shortest end of its path that is unique, unlike the batch's own files."""
-    ends = {each: list(_ends(each)) for each in locations}
-    names = {each: safe_name(ends[each][0]) for each in locations}
-    for length in range(1, max(map(len, ends.values()))):
-        counts = Counter(names.values())
-        for each in locations:
-            if counts[names[each]] > 1:
-                names[each] = safe_name(ends[each][min(length, len(ends[each]) - 1)])
-    named = _numbered(((name, each) for each, name in names.items()), _TAKEN)
+    """Name each by its stem; where that repeats, by its path below the folder of all."""
+    stems = Counter(map(_stem, locations))
+    folder = os.path.commonpath([Path(each).parent for each in locations])
+    names = []
+    for each in locations:
+        is_unique = stems[_stem(each)] == 1
+        below = "-".join(Path(each).relative_to(folder).parts)
+        names.append((_stem(each) if is_unique else below, each))
+    named = _numbered(names, _TAKEN)
     return [NamedRecording(name=name, location=each) for name, each in named.items()]
 
 
-def _ends(location: str) -> Iterator[str]:
-    """Yield ends of a path, from short to long."""
-    *parents, last = Path(location).parts[1:] or ["root"]
-    plain = last.removesuffix(_COMPRESSED)
-    yield plain.rpartition(".")[0] if plain.endswith(BAG_SUFFIXES) else plain
-    yield last
-    for n_parents in range(1, len(parents) + 1):
-        yield "-".join([*parents[-n_parents:], last])
+def _stem(location: str) -> str:
+    plain = Path(location).name.removesuffix(_COMPRESSED)
+    return plain.rpartition(".")[0] if plain.endswith(BAG_SUFFIXES) else plain
 
 
 def _numbered(named: Iterable[tuple[str, T]], taken: Container[str] = ()) -> dict[str, T]:

@@ -13,7 +13,7 @@ import typer
 from typer import Argument, Option
 
 from gvo.cli import options as opt
-from gvo.cli.terminal import exit_code, interruptible_run, is_shown, say, status, warn
+from gvo.cli.terminal import exit_code, is_shown, say, status, warn, work_on_run
 from gvo.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def batch(
     counts = _count(len(found), "recording"), _count(len(variants), "configuration")
     say(", ".join(counts))
     with (
-        interruptible_run(out, and_then=": the same command goes on") as work,
+        work_on_run(out, and_then=": the same command goes on") as work,
         _progress() as show,
         connected(scheduler, workers) as client,
     ):

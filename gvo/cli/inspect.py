@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from typer import Argument, Option
 
 from gvo.cli import options as opt
-from gvo.cli.terminal import interruptible, progress, say, warn
+from gvo.cli.terminal import Work, progress, say, warn
 from gvo.errors import ConfigurationError, GvoError
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def view(
                 f"{path}: is a run, not a recording; open {path / 'report.html'} to look at it "
                 "(gvo run --rerun FILE writes it for Rerun)"
             )
-    with interruptible() as work, ExitStack() as stack:
+    with Work() as work, ExitStack() as stack:
         reopen = partial(opt.open_source, recordings, options=options)
         player = stack.enter_context(Player(reopen, opt.load(config, set_)))
         truth = _find_truth(player.source)

@@ -15,7 +15,7 @@ from typer import Argument, Option
 
 from gvo._text import cut
 from gvo.cli import options as opt
-from gvo.cli.terminal import ended_by_a_signal, exit_code, say, tell, warn
+from gvo.cli.terminal import Work, exit_code, poses_so_far, say, tell, warn
 from gvo.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -89,12 +89,13 @@ def live(
     out = opt.new_folder(out, "live", force=force)
     outputs.check(force=force)
     page = None if view is None else _address("--view", view)
-    end = _End()
-    with ExitStack() as stack, ended_by_a_signal(end, out):
+    has_signal = threading.Event()
+    with ExitStack() as stack, Work() as work:
+        work.on_signal = has_signal.set
         sinks = _connect(camera, qos, foxglove, stack)
         kind, *devices = camera
         if kind in _NETWORKS:
-            source, base_frame = _wait(sinks[0], parameters, options, end, frame)
+            source, base_frame = _wait(sinks[0], parameters, options, has_signal, frame)
         else:
             source = _own_camera(devices, parameters, options, sensor, is_rectified)
             base_frame = find_base_frame(source, frame)
@@ -107,29 +108,13 @@ def live(
             raise ConfigurationError(f"--queue, --max-lag: {error}") from error
         if page is not None:
             _show(odometry, source, page, stack)
-        end.follow(odometry.stop)
+        work.on_signal, work.stands = odometry.stop, poses_so_far(out)
+        if has_signal.is_set():
+            odometry.stop()
         runs = odometry.run(out, outputs=outputs, force=force, on_progress=_status(odometry))
     for folder, result in runs:
         tell(result, folder)
     raise typer.Exit(exit_code(all(result.is_complete for _, result in runs)))
-
-
-class _End:
-    """What the first signal does: it ends the wait for a camera, and later the run."""
-
-    def __init__(self) -> None:
-        self.has_come = threading.Event()
-        self._stop: Callable[[], None] = lambda: None
-
-    def __call__(self) -> None:
-        self.has_come.set()
-        self._stop()
-
-    def follow(self, stop: Callable[[], None]) -> None:
-        """Call `stop` when the signal comes, now if it has come."""
-        self._stop = stop
-        if self.has_come.is_set():
-            stop()
 
 
 def _connect(words: list[str], qos: _Qos, foxglove: str | None, stack: ExitStack) -> list[Sink]:
@@ -183,7 +168,11 @@ def _show(odometry: LiveOdometry, source: Source, page: tuple[str, int], stack: 
 
 
 def _wait(
-    network: Sink, config: Config, options: RecordingOptions, end: _End, frame: str | None
+    network: Sink,
+    config: Config,
+    options: RecordingOptions,
+    has_signal: threading.Event,
+    frame: str | None,
 ) -> tuple[Source, BaseFrame]:
     """Wait for the topics of a camera and its calibration; return it with its base frame."""
     from gvo.io.poses.base_frame import find_base_frame
@@ -196,7 +185,7 @@ def _wait(
         source = TopicSource(reader, topics=options, calibration=calibration, config=config)
         return source, find_base_frame(source, frame)
 
-    found = wait_for(find, _say, end.has_come)
+    found = wait_for(find, _say, has_signal)
     if found is None:
         raise KeyboardInterrupt
     for line in found[0].info.decisions:

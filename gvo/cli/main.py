@@ -22,16 +22,16 @@ from gvo.cli.live import live
 from gvo.cli.terminal import (
     EXIT_FAULTS,
     EXIT_UNUSABLE,
+    Work,
     ended_by_signals,
     exit_code,
-    interruptible,
-    interruptible_run,
     progress,
     report,
     report_smoothed,
     say,
     status,
     warn,
+    work_on_run,
 )
 from gvo.errors import ConfigurationError, GvoError, OutputError, named_faults
 
@@ -86,7 +86,7 @@ def demo(
     check_place(out)
     say(f"rendering a drive into {out / BAG_NAME}")
     stands = f"what is done is in {out}; the same command begins anew"
-    with interruptible(stands) as work, progress("demo") as show:
+    with Work(stands) as work, progress("demo") as show:
         result = run_demo(
             out,
             on_rendered=work.check,
@@ -146,7 +146,7 @@ def run(
     )
     for line in source.info.decisions:
         say(line)
-    with interruptible_run(out) as work, progress(source.info.name) as show:
+    with work_on_run(out) as work, progress(source.info.name) as show:
         result = run_recording(
             source,
             out,
@@ -262,7 +262,7 @@ def _smoothed(source: EdgeSource | None, out: Path, window: bool, **options: Any
     from gvo.io.edges.lines import read_lines
     from gvo.runs import smooth
 
-    with interruptible_run(out) as work:
+    with work_on_run(out) as work:
         options["on_written"] = work.note_written
         if source is None:
             lines = read_lines(sys.stdin.fileno(), work.check)
@@ -356,7 +356,7 @@ def convert_(
 
     check_new(target)
     source = opt.open_source(recordings, parameters, options)
-    with interruptible(f"{target} is not written; the same command begins anew") as work:
+    with Work(f"{target} is not written; the same command begins anew") as work:
         written = convert(
             source,
             target,

@@ -234,63 +234,31 @@ def status(title: str) -> Iterator[Callable[[str], None]]:
         yield lambda text: shown.update(f"{title}: {text}")
 
 
-@contextmanager
-def _handling(
-    receive: Callable[[list[int]], None], stands: Callable[[], str] = str
-) -> Iterator[list[int]]:
-    """Call `receive` with the signals so far; an interrupt exits as the first signal says.
-
-    What of the work then stands is said in a line.
-    """
-    received: list[int] = []
-
-    def handle(number: int, frame: object) -> None:
-        received.append(number)
-        receive(received)
-
-    before = {number: signal.signal(number, handle) for number in _EXIT_CODES_OF_SIGNALS}
-    try:
-        yield received
-    except KeyboardInterrupt:
-        if words := stands():
-            typer.echo(f"gvo: interrupted; {visible(words)}", err=True)
-        raise SystemExit(_EXIT_CODES_OF_SIGNALS[received[0]] if received else 130) from None
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+def _handle(handlers: Mapping[int, Any]) -> dict[int, Any]:
+    """Set the handlers of signals; return those before."""
+    return {number: signal.signal(number, handler) for number, handler in handlers.items()}
 
 
 @contextmanager
 def ended_by_signals() -> Iterator[None]:
     """Let a signal end the command at once, with one line and its exit code."""
+    received: list[int] = []
 
-    def receive(received: list[int]) -> None:
-        raise SystemExit(_EXIT_CODES_OF_SIGNALS[received[-1]])
+    def receive(number: int, frame: object) -> None:
+        received.append(number)
+        raise SystemExit(_EXIT_CODES_OF_SIGNALS[number])
 
-    with _handling(receive) as received:
-        try:
-            yield
-        finally:
-            if received:
-                typer.echo("gvo: interrupted; the same command begins anew", err=True)
-
-
-@contextmanager
-def ended_by_a_signal(stop: Callable[[], None], out: Path) -> Iterator[None]:
-    """Let the first signal call `stop`, and a second one interrupt what then still goes on."""
-
-    def receive(received: list[int]) -> None:
-        if len(received) > 1:
-            raise KeyboardInterrupt
-        # In a thread: the signal may have come into code that holds a lock which `stop` needs.
-        threading.Thread(target=stop, daemon=True).start()
-
-    with _handling(receive, lambda: _poses_so_far(out) if out.exists() else ""):
+    before = _handle(dict.fromkeys(_EXIT_CODES_OF_SIGNALS, receive))
+    try:
         yield
+    finally:
+        if received:
+            typer.echo("gvo: interrupted; the same command begins anew", err=True)
+        _handle(before)
 
 
-class Work:
-    """Work of many steps, which a signal ends between two of them.
+class Work(AbstractContextManager["Work"]):
+    """Work of many steps, which a signal ends between two of them by a line and an exit code.
 
     Parameters
     ----------
@@ -298,21 +266,46 @@ class Work:
         Said of an interrupted work: what of it stands, and how to go on.
     undrawn : str
         Said instead once all is written and only pictures are missing.
+
+    Attributes
+    ----------
+    on_signal : callable or None
+        Called in a thread when the first signal comes.
     """
 
-    def __init__(self, stands: str, undrawn: str) -> None:
-        self._stands, self._undrawn = stands, undrawn
-        self._has_signal = self._is_written = False
+    def __init__(self, stands: str = "", undrawn: str = "") -> None:
+        self.stands, self._undrawn = stands, undrawn
+        self.on_signal: Callable[[], None] | None = None
+        self._received: list[int] = []
+        self._before: dict[int, Any] = {}
+        self._is_written = False
 
-    def receive(self, received: list[int]) -> None:
+    def __enter__(self) -> Work:
+        self._before = _handle(dict.fromkeys(_EXIT_CODES_OF_SIGNALS, self._receive))
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        _handle(self._before)
+        if kind is not KeyboardInterrupt:
+            return
+        words = self._undrawn if self._is_written and self._undrawn else self.stands
+        if words:
+            typer.echo(f"gvo: interrupted; {visible(words)}", err=True)
+        number = self._received[0] if self._received else signal.SIGINT
+        raise SystemExit(_EXIT_CODES_OF_SIGNALS[number]) from None
+
+    def _receive(self, number: int, frame: object) -> None:
         """Note a signal; a second one, or one while pictures are drawn, interrupts at once."""
-        self._has_signal = True
-        if self._is_written or len(received) > 1:
+        self._received.append(number)
+        if self._is_written or len(self._received) > 1:
             raise KeyboardInterrupt
+        if self.on_signal is not None:
+            # The signal may have come into code that holds a lock which is needed there.
+            threading.Thread(target=self.on_signal, daemon=True).start()
 
     def check(self, state: object = None) -> None:
         """End the work if a signal has come; called between two steps."""
-        if self._has_signal:
+        if self._received:
             raise KeyboardInterrupt
 
     def checking(self, show: Callable[[Any], None]) -> Callable[[Any], None]:
@@ -329,26 +322,13 @@ class Work:
         self._is_written = True
         self.check()
 
-    def stands(self) -> str:
-        """Return what is said where the work is interrupted now."""
-        return self._undrawn if self._is_written and self._undrawn else self._stands
 
-
-@contextmanager
-def interruptible(stands: str = "", undrawn: str = "") -> Iterator[Work]:
-    """Yield work that a signal ends; see `Work`."""
-    work = Work(stands, undrawn)
-    with _handling(work.receive, work.stands):
-        yield work
-
-
-def interruptible_run(
-    out: Path, *, and_then: str = "; --force begins anew"
-) -> AbstractContextManager[Work]:
+def work_on_run(out: Path, *, and_then: str = "; --force begins anew") -> Work:
     """Return work that writes poses into a folder while it goes on."""
     undrawn = f"all is computed and in {out}, not drawn{and_then}, gvo compare --report draws it"
-    return interruptible(_poses_so_far(out, and_then), undrawn)
+    return Work(f"{poses_so_far(out)}{and_then}", undrawn)
 
 
-def _poses_so_far(out: Path, and_then: str = "") -> str:
-    return f"the poses so far are in {out}{and_then}"
+def poses_so_far(out: Path) -> str:
+    """Return where the poses of an interrupted run are."""
+    return f"the poses so far are in {out}"

@@ -105,7 +105,7 @@ def test_a_name_is_the_stem_where_that_is_enough() -> None:
 
 
 def test_what_has_one_stem_is_told_apart_by_its_ending_or_its_folders() -> None:
-    asked = ["/x/a.bag", "/x/a.mcap", "/p/1/drive.bag", "/p/2/drive.bag", "/p/b.bag"]
+    asked = ["/p/a.bag", "/p/a.mcap", "/p/1/drive.bag", "/p/2/drive.bag", "/p/b.bag"]
     expected = ["a.bag", "a.mcap", "1-drive.bag", "2-drive.bag", "b"]
     assert names(find_recordings(asked)) == expected
 

@@ -12,7 +12,7 @@ import gtsam
 import pytest
 
 import gvo
-from gvo.cli.terminal import ended_by_a_signal
+from gvo.cli.terminal import Work
 from gvo.frontend.klt import KltFrontend
 from gvo.io.bag.reader import BagMessage
 from gvo.runs.smooth import Smoother
@@ -154,16 +154,19 @@ def test_a_signal_while_the_demo_runs_ends_in_one_line(
     assert answer.err == f"gvo: interrupted; what is done is in {tmp_path}; {ANEW}\n"
 
 
-def test_a_second_signal_ends_a_live_run_and_says_where_its_poses_are(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_second_signal_interrupts_work_that_the_first_one_did_not_end(
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     stopped = threading.Event()
+    work = Work("this stands")
+    work.on_signal = stopped.set
 
     def send_two() -> None:
-        os.kill(os.getpid(), signal.SIGINT)
-        assert stopped.wait(60)
-        os.kill(os.getpid(), signal.SIGINT)
+        with work:
+            os.kill(os.getpid(), signal.SIGINT)
+            assert stopped.wait(60)
+            os.kill(os.getpid(), signal.SIGINT)
 
-    with pytest.raises(SystemExit, match="130"), ended_by_a_signal(stopped.set, tmp_path):
+    with pytest.raises(SystemExit, match="130"):
         send_two()
-    assert capsys.readouterr().err == f"gvo: interrupted; the poses so far are in {tmp_path}\n"
+    assert capsys.readouterr().err == "gvo: interrupted; this stands\n"
