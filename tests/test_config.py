@@ -50,7 +50,6 @@ def test_settings_win_over_the_file_and_later_ones_over_earlier(tmp_path: Path) 
     [
         ("window.sizee=5", "window.size"),
         ("depth.sigma=1", "depth.sigma_px"),
-        ("windw.n_links=3", "window"),
     ],
 )
 def test_an_unknown_key_names_the_nearest(setting: str, nearest: str) -> None:

@@ -79,7 +79,7 @@ def test_help_names_all_commands_on_a_screen(command: Command) -> None:
 def drawn(drive_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of which all is drawn that can be."""
     out = tmp_path_factory.mktemp("drawn")
-    outputs = gvo.RunOutputs(overlay=out / "film.webm", plots=out / "plots")
+    outputs = gvo.RunOutputs(overlay=out / "film.webm")
     result = run_of(drive_bag, out, excerpt=Excerpt(duration_s=0.4), outputs=outputs)
     assert result.is_complete
     assert result.report == out / "report.html"
@@ -94,21 +94,16 @@ def test_drawing_changes_nothing_of_the_run(
     assert (answer.code, answer.err) == (0, "")
     assert "m in 4 frames, all tracked; " in answer.out
     assert_same_files(tmp_path, drawn)
-    drawings = {"trajectories.png", "report.html", "film.webm", "plots"}
+    drawings = {"trajectories.png", "report.html", "film.webm"}
     assert names_of(drawn) - names_of(tmp_path) == drawings
 
 
-def test_the_report_is_one_file_with_the_plots_beside_it(drawn: Path) -> None:
+def test_the_report_is_one_file(drawn: Path) -> None:
     page = (drawn / "report.html").read_text(encoding="utf-8")
     assert page.lstrip().lower().startswith("<!doctype html>")
     assert not OUTSIDE.search(page)
     for key in ("window.link_gain", "ransac.min_inliers"):
         assert key.partition(".")[2] in page
-    plots = sorted((drawn / "plots").iterdir())
-    assert {path.stem for path in plots if path.suffix == ".png"} == {path.stem for path in plots}
-    assert {path.stem for path in plots if path.suffix == ".pdf"} == {path.stem for path in plots}
-    assert "01_above" in {path.stem for path in plots}
-    assert all(starts_rightly(path) for path in plots)
 
 
 def test_the_film_shows_each_frame(drawn: Path) -> None:

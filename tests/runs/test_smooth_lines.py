@@ -113,7 +113,7 @@ _requests = st.fixed_dictionaries(
 
 @settings(
     suppress_health_check=[HealthCheck.function_scoped_fixture],
-    max_examples=settings().max_examples // 4,  # a run each
+    max_examples=settings().max_examples // 8,  # a run each
 )
 @given(st.lists(_requests.map(json.dumps) | st.text(max_size=5), max_size=12))
 def test_any_stream_is_answered_by_line_in_finite_numbers(tmp_path: Path, lines: list[str]) -> None:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from contextlib import AbstractContextManager
+from typing import Self
 
 from gvo.types import Estimate, FaultyFrame, Frame, FrameResult, Optimum
 
 
-class FileOutput(AbstractContextManager["FileOutput"], ABC):
-    """A file of a run, open inside a `with` block; all poses are of the base frame.
+class FileOutput:
+    """A file of a run, open inside a `with` block; subclasses override what they write.
 
     It is written under another name in the same folder and takes its own when it is closed, also
     where the run is interrupted. Without a single frame no file is left.
@@ -23,7 +22,6 @@ class FileOutput(AbstractContextManager["FileOutput"], ABC):
 
     _is_open = True
 
-    @abstractmethod
     def add_frame(self, frame: Frame, result: FrameResult) -> None:
         """Write the result of a frame."""
 
@@ -42,10 +40,11 @@ class FileOutput(AbstractContextManager["FileOutput"], ABC):
             self._is_open = False
             self._complete()
 
-    @abstractmethod
     def _complete(self) -> None:
         """Write the last lines, and give the file its name."""
 
+    def __enter__(self) -> Self:
+        return self
+
     def __exit__(self, *exception: object) -> None:
-        """Close it."""
         self.close()

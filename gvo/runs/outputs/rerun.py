@@ -157,7 +157,7 @@ class RunRerun(FileOutput):
         self._part = PartFile(self.path)
         with self._part.refused_on_error():
             self._file = self._part.part.open("wb")
-        self._stream = self._recording.binary_stream()
+        self._stream = rr.binary_stream(self._recording)
         self._recording.send_blueprint(_layout())
         self._recording.send_recording_name(self.path.stem)
         self._log(f"{_CAMERA}/image", _pinhole(self._camera), is_static=True)
