@@ -181,12 +181,12 @@ def view(task: Task) -> Picture | None:
     truth = gvo.open_recording(task.bag).ground_truth()
     with (
         Player(lambda config: gvo.open_recording(task.bag, config=config), Config()) as player,
-        serve(player, port=0, truth=truth, name=task.bag.name) as server,
+        serve(player, port=0, truth=truth, name=task.bag.name) as page,
     ):
         for _ in range(task.frame + 1):
             player.step()
         player.wait()
-        driver = open_page(server.url)
+        driver = open_page(page.url)
         try:
             wait_until(lambda: str(driver.execute_script(SHOWN_FRAME)).startswith(f"{task.frame} "))
             driver.execute_script(HIDE_COMPLAINT)
@@ -196,7 +196,7 @@ def view(task: Task) -> Picture | None:
             if view is None:
                 raise RecordingError(f"{task.bag}: {player.fault}")
             R, t = view.T_world_frame[:3, :3], view.T_world_frame[:3, 3]
-            for client in server.viser.get_clients().values():
+            for client in page.server.get_clients().values():
                 client.camera.position, client.camera.look_at = R @ FROM_CAM + t, R @ TO_CAM + t
             time.sleep(3.0)  # the page draws on its own time
             return decoded(driver.get_screenshot_as_png())

@@ -248,7 +248,6 @@ def compose_overlay(
     camera: PinholeCamera,
     *,
     index: int | None = None,
-    rate_hz: float | None = None,
     max_width: int = MAX_WIDTH_PX,
 ) -> ImageArray:
     """Draw the result of one frame: status, flow and depth.
@@ -267,8 +266,6 @@ def compose_overlay(
         Of the recording.
     index : int, optional
         Number of the frame for the header.
-    rate_hz : float, optional
-        Frame rate for the header; from the stage times where omitted.
     max_width : int
         Maximum width, pixels; at least 640.
 
@@ -288,7 +285,7 @@ def compose_overlay(
     layout = Layout.of(camera, max_width)
     canvas = layout.empty()
     _draw_panels(canvas, layout, frame, placed_matches(result), camera)
-    _write_header(canvas, layout, result, index=index, rate_hz=rate_hz)
+    _write_header(canvas, layout, result, index)
     _write_footer(canvas, layout, camera, result.reason)
     return canvas
 
@@ -303,7 +300,7 @@ def compose_faulty(
     """Draw an unusable frame: dark, with the reason; otherwise as `compose_overlay`."""
     layout = Layout.of(camera, max_width)
     canvas = layout.empty()
-    _write_header(canvas, layout, frame, index=index)
+    _write_header(canvas, layout, frame, index)
     _write_footer(canvas, layout, camera, "")
     texts = textwrap.wrap(frame.reason, layout.panel[0] // _CHARACTER_PX)
     write_lines(layout.panels(canvas)[0], [f"{Status.SKIPPED}: no pose", *texts])
@@ -460,12 +457,7 @@ def _depth_picture(
 
 
 def _write_header(
-    canvas: ImageArray,
-    layout: Layout,
-    result: FrameResult | FaultyFrame,
-    *,
-    index: int | None,
-    rate_hz: float | None = None,
+    canvas: ImageArray, layout: Layout, result: FrameResult | FaultyFrame, index: int | None
 ) -> None:
     """Write status, number, stamp, counts and rate into the header."""
     status = result.status if isinstance(result, FrameResult) else Status.SKIPPED
@@ -479,7 +471,8 @@ def _write_header(
         _write_row(canvas, _counts(result), (_MARGIN_PX, lower))
         loop = shortened(loop_text(result), layout.size[0] - _MARGIN_PX - end)
         write(canvas, loop, (layout.size[0] - text_width(loop) - _MARGIN_PX, upper), LOOP_COLOUR)
-        rate = _rate_text(result, rate_hz)
+        elapsed_ms = sum(result.stage_ms.values())
+        rate = f"{elapsed_ms:.1f} ms   {1e3 / elapsed_ms:.1f} Hz" if elapsed_ms > 0.0 else ""
         write(canvas, rate, (layout.size[0] - text_width(rate) - _MARGIN_PX, lower))
 
 
@@ -522,12 +515,3 @@ def _write_badge(canvas: ImageArray, status: Status) -> int:
         field[:, [0, -1]] = WHITE
     write(canvas, text, (2 * _MARGIN_PX, _ROWS_PX[0]), BLACK if status in _DARK_TEXT else WHITE)
     return right
-
-
-def _rate_text(result: FrameResult, rate_hz: float | None) -> str:
-    elapsed_ms = sum(result.stage_ms.values())
-    if rate_hz is None and elapsed_ms > 0.0:
-        rate_hz = 1e3 / elapsed_ms
-    parts = [f"{elapsed_ms:.1f} ms"] if elapsed_ms > 0.0 else []
-    parts += [] if rate_hz is None else [f"{rate_hz:.1f} Hz"]
-    return "   ".join(parts)

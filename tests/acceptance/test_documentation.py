@@ -114,7 +114,7 @@ def test_python_in_the_documentation_runs(workplace: Path, page: str, code: str)
 @pytest.fixture
 def page_that_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let `gvo view` end where it would wait for its reader."""
-    monkeypatch.setattr("gvo.viz.view.server.ViewServer.wait", lambda *_: True)
+    monkeypatch.setattr("gvo.viz.view.page.Page.wait", lambda *_: True)
 
 
 @pytest.mark.usefixtures("page_that_ends", "clone")

@@ -13,7 +13,8 @@ import pytest
 
 from gvo.io.bag.reader import BagReader
 from gvo.io.bag.topics import COMPRESSED_TYPE, IMAGE_TYPE
-from tests.conftest import assert_same_files, run_of
+from tests.conftest import assert_same_files
+from tests.live.conftest import N_FRAMES
 from tests.live.network import Network, Outlet, recorded
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "ros" / "ros2_node.py"
@@ -132,7 +133,7 @@ def node(monkeypatch: pytest.MonkeyPatch) -> FakeNode:
 
 @pytest.mark.acceptance
 def test_a_camera_is_tracked_as_in_its_bag(
-    node: FakeNode, drive_bag: Path, tmp_path: Path, request: pytest.FixtureRequest
+    node: FakeNode, drive_bag: Path, drive_run: Path, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     spec = importlib.util.spec_from_file_location("ros2_node", SCRIPT)
     assert spec is not None
@@ -167,9 +168,10 @@ def test_a_camera_is_tracked_as_in_its_bag(
     finally:
         is_over.set()
     player.join(timeout=60)
-    run_of(drive_bag, tmp_path / "run")
-    assert_same_files(tmp_path / "live", tmp_path / "run")
-    assert [vars(each) for each in saved] == [{"success": True, "message": "20 frames are written"}]
+    assert_same_files(tmp_path / "live", drive_run)
+    assert [vars(each) for each in saved] == [
+        {"success": True, "message": f"{N_FRAMES} frames are written"}
+    ]
     assert node.answers.keys() == {"/gvo/reset", "/gvo/save"}
     qos = {name: (each.reliability, each.durability) for name, each in node.received_as.items()}
     assert qos["/tf_static"] == (RELIABLE, HELD)

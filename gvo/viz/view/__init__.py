@@ -12,8 +12,8 @@ from gvo.errors import missing_extra
 if TYPE_CHECKING:
     from gvo.trajectory.trajectory import Trajectory
     from gvo.viz.view.live import LivePlayer
+    from gvo.viz.view.page import Page
     from gvo.viz.view.player import Player
-    from gvo.viz.view.server import ViewServer
 
 __all__ = ["serve"]
 
@@ -25,7 +25,7 @@ def serve(
     port: int = 8080,
     truth: Trajectory | None = None,
     name: str = "",
-) -> ViewServer:
+) -> Page:
     """Serve the page of a recording that is tracked, or of a run that goes on elsewhere.
 
     Parameters
@@ -35,7 +35,7 @@ def serve(
     host : str
         Address to bind to; 0.0.0.0 lets everyone on the network steer the page.
     port : int
-        Where it is taken, the next free one is used (see `ViewServer.note`); 0: any.
+        Where it is taken, the next free one is used (see `Page.note`); 0: any.
     truth : Trajectory, optional
         Of the camera, in any world; drawn beside the estimates.
     name : str
@@ -50,6 +50,6 @@ def serve(
         import viser  # noqa: F401 - only whether it is there
     except ImportError as error:
         raise missing_extra("the page in the browser needs viser", "view") from error
-    from gvo.viz.view.page import serve_player
+    from gvo.viz.view.page import Page
 
-    return serve_player(player, host=host, port=port, truth=truth, name=name)
+    return Page(player, host=host, port=port, truth=truth, name=name)

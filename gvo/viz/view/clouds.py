@@ -19,15 +19,7 @@ from gvo.viz.scene import Points, grey_values
 Cloud: TypeAlias = tuple[NDArray[np.float32], NDArray[np.uint8]]
 MAX_FRAME_POINTS = 5_000
 MAX_POINTS = 200_000
-# Size of the first voxels, relative to the median distance of a point from its camera.
-_VOXEL_SHARE = 0.01
-_MIN_VOXEL_M = 1e-4
-_VOXEL_BITS = 21  # of each of three coordinates in one integer
-
-
-def empty_cloud() -> Cloud:
-    """Return a cloud without points."""
-    return np.zeros((0, 3), dtype=np.float32), np.zeros((0, 3), dtype=np.uint8)
+NO_CLOUD: Cloud = np.zeros((0, 3), dtype=np.float32), np.zeros((0, 3), dtype=np.uint8)
 
 
 def frame_cloud(frame: Frame, points: Points, camera: PinholeCamera, config: DepthConfig) -> Cloud:
@@ -59,31 +51,12 @@ def _as_colours(greys: ImageArray) -> NDArray[np.uint8]:
 
 
 def accumulate(clouds: Sequence[tuple[FloatArray, Cloud]]) -> Cloud:
-    """Place clouds by their T_world_frame (4, 4), and thin them to at most 200,000 points."""
-    if sum(len(points) for _, (points, _) in clouds) == 0:
-        return empty_cloud()
-    points_cam = [points.astype(np.float64) for _, (points, _) in clouds]
-    points = np.concatenate(list(map(se3.transform_points, [T for T, _ in clouds], points_cam)))
-    colours = np.concatenate([colours for _, (_, colours) in clouds])
-    median_m = float(np.median(np.linalg.norm(np.concatenate(points_cam), axis=1)))
-    chosen = thin(points, _VOXEL_SHARE * median_m)
-    return points[chosen].astype(np.float32), colours[chosen]
-
-
-def thin(points: FloatArray, voxel_m: float, *, n_max: int = MAX_POINTS) -> NDArray[np.intp]:
-    """Return indices of one point (n, 3) per voxel, whose edge doubles until at most n_max."""
-    indices = np.arange(len(points))
-    lowest = points.min(axis=0) if len(points) else np.zeros(3)
-    extent = float((points - lowest).max()) if len(points) else 0.0
-    voxel_m = max(voxel_m, extent / (2**_VOXEL_BITS - 2), _MIN_VOXEL_M)
-    while len(indices) > 0:
-        cells = ((points[indices] - lowest) / voxel_m).astype(np.int64)
-        keys = (cells[:, 0] << 2 * _VOXEL_BITS) | (cells[:, 1] << _VOXEL_BITS) | cells[:, 2]
-        indices = np.sort(indices[np.unique(keys, return_index=True)[1]])
-        if len(indices) <= n_max:
-            break
-        voxel_m *= 2.0
-    return indices
+    """Place clouds by their T_world_frame (4, 4); of more than 200,000 points keep each n-th."""
+    placed = [se3.transform_points(T, points.astype(np.float64)) for T, (points, _) in clouds]
+    points = np.concatenate([NO_CLOUD[0], *placed]).astype(np.float32)
+    colours = np.concatenate([NO_CLOUD[1], *(colours for _, (_, colours) in clouds)])
+    stride = max(math.ceil(len(points) / MAX_POINTS), 1)
+    return points[::stride], colours[::stride]
 
 
 def halve(cloud: Cloud) -> Cloud:

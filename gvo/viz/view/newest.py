@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 from threading import Lock
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -16,15 +16,14 @@ from gvo.config import DepthConfig
 from gvo.frontend.klt import image_of
 from gvo.geometry.camera import PinholeCamera
 from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, ImageArray
-from gvo.viz.overlay import compose_overlay, draw_matches
+from gvo.viz.overlay import compose_faulty, compose_overlay
 from gvo.viz.scene import History, Path, Scene, matched_points, scene
-from gvo.viz.view.clouds import Cloud, accumulate, empty_cloud, frame_cloud, halve
+from gvo.viz.view.clouds import NO_CLOUD, Cloud, accumulate, frame_cloud, halve
 
 # Newest poses of the window that are drawn; the window may hold all.
 _N_POSES = 24
 _N_SHOWN_POSES = 1000  # of a path, at most
 _MAX_KEPT_POINTS = 1_000_000  # of all keyframes together
-_RATE_SHARE = 0.1  # of the newest frame in the mean rate
 _MAX_WIDTH_PX = 480
 
 
@@ -71,9 +70,8 @@ class FrameView:
 
 class _Shown(NamedTuple):
     frame: Frame | FaultyFrame
-    result: FrameResult | None
+    result: FrameResult | None  # none of a faulty frame
     number: int
-    rate_hz: float
     depth: DepthConfig
 
 
@@ -102,7 +100,6 @@ class Newest:
         self.n_changes = 0
         self._clouds: dict[int, Cloud] = {}
         self._stamps_ns: deque[int] = deque(maxlen=_N_POSES)
-        self._frame_ms: float | None = None
         self._T_world_frame = np.eye(4)
         self._shown: _Shown | None = None
         self._view: FrameView | None = None
@@ -120,14 +117,14 @@ class Newest:
         Without the window the frame is counted, and not shown.
         """
         with self._lock:
-            index, self.n_done = self.n_done, self.n_done + 1
+            shown = _Shown(frame, result, self.n_done, depth)
+            self.n_done += 1
             if result is not None and not isinstance(frame, FaultyFrame):
                 self._add_result(frame, result, depth)
             if window is not None:
                 known = [*sorted({*self.history.keyframes, *self._stamps_ns})]
                 self.history.correct(window.estimate(ns) for ns in known if ns in window)
-                rate_hz = 1e3 / max(self._frame_ms or 0.0, 1e-3)
-                self._shown, self._view = _Shown(frame, result, index, rate_hz, depth), None
+                self._shown, self._view = shown, None
                 self.n_changes += 1
 
     def _add_result(self, frame: Frame, result: FrameResult, depth: DepthConfig) -> None:
@@ -136,9 +133,6 @@ class Newest:
         self.history.add(result)
         self._T_world_frame = result.causal.T_world_frame
         self._stamps_ns.append(result.stamp_ns)
-        spent_ms = sum(result.stage_ms.values())
-        before_ms = spent_ms if self._frame_ms is None else self._frame_ms
-        self._frame_ms = (1.0 - _RATE_SHARE) * before_ms + _RATE_SHARE * spent_ms
         if result.stamp_ns in result.keyframes_ns:
             cloud = frame_cloud(frame, matched_points(result), self._camera, depth)
             self._clouds[result.stamp_ns] = cloud
@@ -158,25 +152,13 @@ class Newest:
             shown = self._shown
             if shown is None or self._view is not None:
                 return self._view
-            result = shown.result
-            seen = None if result is None else scene(result, self.history)
-            paths = self.history.paths(_N_SHOWN_POSES)
-            loops = self.history.tracks["smoothed"].lines(self.history.loops)
-            T_world_frame = self._T_world_frame
-        image, overlay, cloud = self._pictures(shown, seen)
-        view = FrameView(
-            index=shown.number,
-            stamp_ns=shown.frame.stamp_ns,
-            result=result,
-            scene=seen,
-            reason=_reason(shown),
-            T_world_frame=T_world_frame,
-            paths=paths,
-            loops=loops,
-            image=_small_picture(image),
-            overlay=overlay,
-            cloud=cloud,
-        )
+            known = {
+                "T_world_frame": self._T_world_frame,
+                "paths": self.history.paths(_N_SHOWN_POSES),
+                "loops": self.history.tracks["smoothed"].lines(self.history.loops),
+            }
+            seen = None if shown.result is None else scene(shown.result, self.history)
+        view = self._drawn(shown, seen, known)
         with self._lock:
             if self._shown is shown:
                 self._view = view
@@ -189,29 +171,29 @@ class Newest:
             clouds = [(track.at(ns), cloud) for ns, cloud in self._clouds.items()]
         return accumulate([(T, cloud) for T, cloud in clouds if T is not None])
 
-    def _pictures(self, shown: _Shown, seen: Scene | None) -> tuple[ImageArray, ImageArray, Cloud]:
-        """Return the image, the overlay and the points of a frame; of a faulty one why it is."""
-        frame, result = shown.frame, shown.result
-        if isinstance(frame, FaultyFrame) or result is None or seen is None:
-            dark = _draw_fault(self._camera, _reason(shown))
-            return dark, dark, empty_cloud()
-        overlay = compose_overlay(
-            frame, result, self._camera, index=shown.number, rate_hz=shown.rate_hz
+    def _drawn(self, shown: _Shown, seen: Scene | None, known: dict[str, Any]) -> FrameView:
+        """Return a frame with its pictures; a faulty one is dark, and says why."""
+        frame, result, camera = shown.frame, shown.result, self._camera
+        if isinstance(frame, FaultyFrame):
+            image = np.zeros((camera.height, camera.width), dtype=np.uint8)
+            overlay = compose_faulty(frame, camera, index=shown.number)
+            reason, cloud = frame.reason, NO_CLOUD
+        else:
+            found = cast("FrameResult", result)
+            image, reason = image_of(frame), found.reason
+            overlay = compose_overlay(frame, found, camera, index=shown.number)
+            cloud = frame_cloud(frame, matched_points(found), camera, shown.depth)
+        return FrameView(
+            index=shown.number,
+            stamp_ns=frame.stamp_ns,
+            result=result,
+            scene=seen,
+            reason=reason,
+            image=_small_picture(image),
+            overlay=overlay,
+            cloud=cloud,
+            **known,
         )
-        cloud = frame_cloud(frame, seen.points, self._camera, shown.depth)
-        return image_of(frame), overlay, cloud
-
-
-def _reason(shown: _Shown) -> str:
-    told = shown.frame if isinstance(shown.frame, FaultyFrame) else shown.result
-    return "" if told is None else told.reason
-
-
-def _draw_fault(camera: PinholeCamera, reason: str) -> ImageArray:
-    """Return a dark picture that tells why there is no frame, BGR."""
-    none = np.zeros((0, 2))
-    dark = np.full((camera.height, camera.width), 40, dtype=np.uint8)
-    return draw_matches(dark, none, none, np.zeros(0, np.bool_), lines=[f"no frame: {reason}"])
 
 
 def _small_picture(image: ImageArray) -> ImageArray:

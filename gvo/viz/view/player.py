@@ -6,7 +6,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 
 from gvo.config import Config
@@ -17,9 +17,6 @@ from gvo.viz.view.newest import Newest
 from gvo.viz.view.tracking import OpenSource, Tracking
 
 _LOGGER = logging.getLogger(__name__)
-
-# A gap of the stamps is not waited for longer, seconds of the recording.
-_MAX_GAP_S = 1.0
 
 
 class Player(AbstractContextManager["Player"]):
@@ -43,8 +40,6 @@ class Player(AbstractContextManager["Player"]):
         The newest frame, and the history since the start or the last restart.
     is_playing : bool
         Frames follow by themselves.
-    is_finished : bool
-        The recording is read to its end, or as far as it can be.
     fault : str
         The last error, in one line; empty after a restart or another configuration.
 
@@ -76,9 +71,8 @@ class Player(AbstractContextManager["Player"]):
         self._restart_index: int | None = None
         self._is_closed = False
         self._is_working = False
-        self.is_finished = False
         self.fault = ""
-        self._due_s = -math.inf  # when the frame shown was due, by the clock of `monotonic`
+        self._began_s = -math.inf  # when the last frame was begun, by the clock of `monotonic`
         self._thread = threading.Thread(target=self._work, name="player", daemon=True)
         self._thread.start()
 
@@ -93,7 +87,7 @@ class Player(AbstractContextManager["Player"]):
         """Go on, at the speed that is set."""
         with self._changing():
             self.is_playing = True
-            self._due_s = -math.inf
+            self._began_s = -math.inf
 
     def pause(self) -> None:
         """Stop after the frame under way."""
@@ -164,6 +158,16 @@ class Player(AbstractContextManager["Player"]):
         return self._tracking.newest
 
     @property
+    def source(self) -> Source:
+        """The recording."""
+        return self._tracking.source
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the recording is read to its end, or as far as it can be."""
+        return self._tracking.is_finished
+
+    @property
     def n_frames(self) -> int:
         """Frames that the recording announces; those that were read, once it is finished."""
         n_done = self.newest.n_done
@@ -172,109 +176,59 @@ class Player(AbstractContextManager["Player"]):
     @property
     def is_busy(self) -> bool:
         """Whether something is under way or left to do."""
-        if self._is_closed:
-            return self._is_working
-        return self.is_playing or self._is_working or self._is_asked()
-
-    @property
-    def source(self) -> Source:
-        """The recording."""
-        return self._tracking.source
+        is_asked = self.is_playing or self._n_steps > 0 or self._restart_index is not None
+        return self._is_working or (is_asked and not self._is_closed)
 
     # On the thread
 
     def _work(self) -> None:
         with one_opencv_thread():
             while self._wait_for_work():
-                if not self._guarded(self._turn):
-                    with self._changed:
-                        self.is_playing, self._n_steps, self._restart_index = False, 0, None
-        self._guarded(self._tracking.close)
+                try:
+                    self._turn()
+                except GvoError as error:
+                    self._stop(str(error))
+                except Exception as error:  # the thread must go on
+                    _LOGGER.exception("the player failed")
+                    self._stop(f"{type(error).__name__}: {error}")
+        self._tracking.close()
 
     def _wait_for_work(self) -> bool:
-        """Return whether there is work; False at the end of the thread."""
+        """Wait for a command, or until the next frame is due; return False once closed."""
         with self._changed:
             self._is_working = False
             self._changed.notify_all()
-            self._changed.wait_for(lambda: self._is_closed or self.is_busy)
+            while not (self._is_closed or self._n_steps or self._restart_index is not None):
+                if not self.is_playing:
+                    self._changed.wait()
+                    continue
+                gap_s = 0.0 if self._speed is None else self._tracking.gap_s / self._speed
+                pause_s = self._began_s + gap_s - time.monotonic()
+                if pause_s <= 0.0:
+                    break
+                self._changed.wait(pause_s)
             self._is_working = not self._is_closed
             return self._is_working
 
-    def _guarded(self, work: Callable[[], object]) -> bool:
-        """Call; keep an error as `fault`: the thread must go on."""
-        try:
-            work()
-        except GvoError as error:
-            self.fault = str(error)
-        except Exception as error:
-            _LOGGER.exception("the player failed")
-            self.fault = f"{type(error).__name__}: {error}"
-        else:
-            return True
-        return False
-
     def _turn(self) -> None:
-        """Carry out one command: start anew, or track one frame."""
+        """Track the next frame, or the first one after a restart."""
         with self._changed:
-            restart_index, is_stepping = self._restart_index, self._n_steps > 0
-            self._restart_index = None
-            if restart_index is None and is_stepping:
-                self._n_steps -= 1
-        if restart_index is not None:
-            self._start_anew(restart_index)
-        elif (is_stepping or self._wait_until_due()) and not self._advance():
+            index, self._restart_index = self._restart_index, None
+            if index is None:
+                self._n_steps = max(self._n_steps - 1, 0)
+            self._began_s = time.monotonic()
+        if index is not None:
+            tracking = Tracking(self._open_source, self.config, index)
+            self._tracking.close()
+            self._tracking, self.fault = tracking, ""
+        elif self.config is not self._tracking.config:
+            self._take_configuration(self.config)
+        self._tracking.advance()
+        if self.is_finished:
             with self._changed:
                 self.is_playing, self._n_steps = False, 0
 
-    def _start_anew(self, index: int) -> None:
-        tracking = Tracking(self._open_source, self.config, index)
-        self._tracking.close()
-        with self._changed:
-            self._tracking = tracking
-            self.is_finished, self.fault = False, ""
-        self._advance()
-
-    def _wait_until_due(self) -> bool:
-        """Wait until the next frame is due; False where another command came."""
-        gap_s = self._gap_s()
-        with self._changed:
-            while self.is_playing and not (self._is_asked() or self._is_closed):
-                pause_s = 0.0 if self._speed is None else gap_s / self._speed
-                now_s, due_s = time.monotonic(), self._due_s + pause_s
-                if now_s >= due_s:
-                    # A delay of more than a frame is not caught up.
-                    self._due_s = due_s if now_s - due_s <= pause_s else now_s
-                    return True
-                self._changed.wait(due_s - now_s)
-        return False
-
-    def _is_asked(self) -> bool:
-        return self._n_steps > 0 or self._restart_index is not None
-
-    def _gap_s(self) -> float:
-        """Return how long after the newest frame the next one was recorded."""
-        item, last_ns = self._tracking.peek(), self._tracking.last_ns
-        if item is None or last_ns is None:
-            return 0.0
-        return min(max(1e-9 * (item.stamp_ns - last_ns), 0.0), _MAX_GAP_S)
-
-    def _advance(self) -> bool:
-        """Track and show the next frame; return False at the end."""
-        if self.is_finished:
-            return False
-        try:
-            self._take_configuration()
-            is_tracked = self._tracking.advance()
-            self._tracking.peek()  # is it the last one?
-        finally:
-            if self._tracking.is_finished:
-                self._finish()
-        return is_tracked
-
-    def _take_configuration(self) -> None:
-        config = self.config
-        if config is self._tracking.config:
-            return
+    def _take_configuration(self, config: Config) -> None:
         try:
             self._tracking.reconfigure(config)
         except GvoError as error:
@@ -283,8 +237,7 @@ class Player(AbstractContextManager["Player"]):
                 if self.config is config:
                     self.config = self._tracking.config
 
-    def _finish(self) -> None:
-        """Add the smoothed poses of the frames that the window still holds."""
-        self.is_finished = True
-        if self.newest.n_done > self.newest.first_index:
-            self.newest.finish(self._tracking.finish())
+    def _stop(self, fault: str) -> None:
+        with self._changed:
+            self.fault = fault
+            self.is_playing, self._n_steps, self._restart_index = False, 0, None

@@ -1,4 +1,4 @@
-"""The web server of the page: where it binds, what it says, how it ends."""
+"""The web server of the page: where it binds, and whom it answers."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ import errno
 import io
 import ipaddress
 import socket
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -32,61 +30,13 @@ class LocalServer(viser.ViserServer):
         return None
 
 
-class ViewServer(AbstractContextManager["ViewServer"]):
-    """A page that is being served, until it is closed.
-
-    Attributes
-    ----------
-    note : str
-        One line where another port than the one asked for is used, else empty.
-    """
-
-    def __init__(self, server: viser.ViserServer, *, note: str = "") -> None:
-        self.viser, self.note = server, note
-        self._closing: list[Callable[[], None]] = []
-        self._is_closed = threading.Event()
-
-    @property
-    def url(self) -> str:
-        """Address of the page."""
-        host = self.viser.get_host()
-        shown = "localhost" if host in ("0.0.0.0", "::") else host  # noqa: S104 - only shown
-        return f"http://{shown}:{self.viser.get_port()}"
-
-    def on_close(self, action: Callable[[], None]) -> None:
-        """Call this before the server stops."""
-        self._closing.append(action)
-
-    def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until the page is closed; return whether it is."""
-        return self._is_closed.wait(timeout_s)
-
-    def close(self) -> None:
-        """Stop serving; again: nothing."""
-        if self._is_closed.is_set():
-            return
-        try:
-            for action in reversed(self._closing):
-                action()
-        finally:
-            with _silence():
-                self.viser.stop()
-            self._is_closed.set()
-
-    def __exit__(self, *exception: object) -> None:
-        """Close it."""
-        self.close()
-
-
-def open_server(host: str, port: int, *, title: str) -> ViewServer:
+def open_server(host: str, port: int, *, title: str) -> viser.ViserServer:
     """Bind and listen, or raise `ConfigurationError`."""
     free = find_port(host, port)
-    with _silence(), _refusing_strangers(is_local=_is_loopback(host)):
+    with silence(), _refusing_strangers(is_local=_is_loopback(host)):
         server = LocalServer(host=host, port=free, label=title, verbose=False)
     server.gui.configure_theme(show_logo=False, show_share_button=False)
-    is_moved = port not in (0, free)
-    note = f"port {port} of {host} is taken: serving on {free}" if is_moved else ""
-    return ViewServer(server, note=note)
+    return server
 
 
 def is_own_page(origin: str | None, host: str, *, is_local: bool) -> bool:
@@ -149,6 +99,6 @@ def find_port(host: str, port: int) -> int:
     )
 
 
-def _silence() -> contextlib.AbstractContextManager[object]:
+def silence() -> contextlib.AbstractContextManager[object]:
     """Swallow what viser prints."""
     return contextlib.redirect_stdout(io.StringIO())

@@ -1,4 +1,4 @@
-"""Servers of the page that end with the test."""
+"""Pages that end with the test."""
 
 from __future__ import annotations
 
@@ -7,14 +7,21 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from tests.viz.view.fakes import FakePlayer, as_player
+
 if TYPE_CHECKING:
-    from gvo.viz.view.server import ViewServer
+    from gvo.viz.view.page import Page
 
 
 @pytest.fixture
-def view() -> Iterator[ViewServer]:
-    """A page without content, on any port."""
-    from gvo.viz.view.server import open_server
+def player() -> FakePlayer:
+    return FakePlayer()
 
-    with open_server("127.0.0.1", 0, title="gvo") as opened:
+
+@pytest.fixture
+def page(player: FakePlayer) -> Iterator[Page]:
+    """The page of a player that computes nothing, on any port."""
+    from gvo.viz.view import serve
+
+    with serve(as_player(player), port=0) as opened:
         yield opened

@@ -15,7 +15,6 @@ from gvo.types import (
     FloatArray,
     FrameLink,
     FrameResult,
-    IntArray,
     RelativePose,
     StereoFrame,
 )
@@ -32,10 +31,6 @@ def pose_of(index: int) -> FloatArray:
     T = np.eye(4)
     T[2, 3] = float(index)
     return T
-
-
-def stamps_of(n: int) -> IntArray:
-    return PERIOD_NS * np.arange(n, dtype=np.int64)
 
 
 def result_of(index: int, n_points: int = 50, **changes: Any) -> FrameResult:

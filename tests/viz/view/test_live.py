@@ -1,28 +1,22 @@
 """A run that goes on elsewhere, on the page: the newest frame wins, and nothing waits for it."""
 
-from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
-import cv2
 import numpy as np
 import pytest
 
 from gvo.config import Config
-from gvo.geometry.camera import Calibration, PinholeCamera
-from gvo.io.recording import RecordingInfo, Source, StampedImage
+from gvo.io.synthetic import SyntheticRecording
 from gvo.live.odometry import LiveOdometry
 from gvo.live.transport import Parameters
 from gvo.runs.outputs.options import RunOutputs
 from gvo.types import FaultyFrame
+from gvo.viz.view import serve
 from gvo.viz.view.live import LivePlayer
 from gvo.viz.view.newest import FrameView
-from gvo.viz.view.page import Page
 from gvo.viz.view.player import Player
-from gvo.viz.view.server import ViewServer
-from tests.make.recordings import Held
 from tests.make.results import loop_of
 from tests.viz.view.fakes import (
     CAMERA,
@@ -46,13 +40,6 @@ def player(window: FakeWindow) -> LivePlayer:
     opened = LivePlayer(cast(Any, source), Parameters(Config()))
     opened.begin(cast(Any, window))
     return opened
-
-
-@pytest.fixture
-def page(view: ViewServer, player: LivePlayer) -> Iterator[Page]:
-    opened = Page(view.viser, player, truth=None)
-    yield opened
-    opened.close()
 
 
 def add(player: LivePlayer, window: FakeWindow, index: int, **changes: Any) -> None:
@@ -79,15 +66,16 @@ def test_the_newest_frame_is_shown_with_all_paths(player: LivePlayer, window: Fa
         np.testing.assert_allclose(view.paths[name][1][:, 2], np.arange(5.0))
         np.testing.assert_allclose(view.paths[name][1][:, 0], x)
     assert player.newest.view() is view
-
-
-def test_a_faulty_frame_is_shown_at_the_last_pose(player: LivePlayer, window: FakeWindow) -> None:
-    add(player, window, 0)
-    add(player, window, 1)
-    player.add(FaultyFrame(stamp_ns=2 * PERIOD_NS, reason="dropped"), None)
+    # A faulty frame is shown at the last pose.
+    player.add(FaultyFrame(stamp_ns=5 * PERIOD_NS, reason="dropped"), None)
     view = shown(player)
-    assert (view.index, view.result, view.reason) == (2, None, "dropped")
-    np.testing.assert_array_equal(view.T_world_frame, pose_of(1))
+    assert (view.index, view.result, view.reason) == (5, None, "dropped")
+    np.testing.assert_array_equal(view.T_world_frame, pose_of(4))
+    # Another run begins without former paths.
+    player.begin(cast(Any, window))
+    add(player, window, 6)
+    assert (player.newest.first_index, player.n_frames) == (6, 7)
+    assert len(shown(player).paths["causal"][0]) == 1
 
 
 def test_while_it_is_paused_or_nobody_looks_only_poses_are_noted(
@@ -106,25 +94,6 @@ def test_while_it_is_paused_or_nobody_looks_only_poses_are_noted(
     assert len(view.paths["causal"][0]) == 3
 
 
-def test_a_new_run_begins_without_former_paths(player: LivePlayer, window: FakeWindow) -> None:
-    add(player, window, 0)
-    add(player, window, 1)
-    player.begin(cast(Any, window))
-    add(player, window, 2)
-    assert (player.newest.first_index, player.n_frames) == (2, 3)
-    assert len(shown(player).paths["causal"][0]) == 1
-
-
-def test_a_long_path_is_drawn_by_so_many_poses(player: LivePlayer, window: FakeWindow) -> None:
-    for index in range(3000):
-        player.newest.history.add(result_of(index))
-    add(player, window, 3000)
-    stamps_ns, poses = shown(player).paths["causal"]
-    assert 500 <= len(stamps_ns) <= 1000
-    assert (stamps_ns[0], stamps_ns[-1]) == (0, 3000 * PERIOD_NS)
-    np.testing.assert_allclose(poses[:, 2], stamps_ns / PERIOD_NS)
-
-
 def test_loops_go_on_being_drawn_where_poses_are_corrected(
     player: LivePlayer, window: FakeWindow
 ) -> None:
@@ -136,58 +105,36 @@ def test_loops_go_on_being_drawn_where_poses_are_corrected(
     np.testing.assert_allclose(shown(player).loops[:, :, 0], 0.5)
 
 
-def test_the_page_shows_the_run_and_pauses(
-    page: Page, player: LivePlayer, window: FakeWindow
+def test_the_page_shows_the_run_pauses_and_sets_parameters(
+    player: LivePlayer, window: FakeWindow
 ) -> None:
-    add(player, window, 0)
-    add(player, window, 7)
-    page.settle()
-    numbers = cells(page.numbers.content)
-    assert (numbers["frame"], numbers["status"], numbers["inliers"]) == ("1 of 2", "ok", "97")
-    page.playback.toggle()
-    assert not player.is_playing
-    page.playback.press("play")
-    assert player.is_playing
+    with serve(player, port=0) as page:
+        player.is_watched = lambda: True
+        add(player, window, 0)
+        add(player, window, 7)
+        page.settle()
+        numbers = cells(page.numbers.content)
+        assert (numbers["frame"], numbers["status"], numbers["inliers"]) == ("1 of 2", "ok", "97")
+        page.press("pause")
+        assert not player.is_playing
+        page.press("play")
+        assert player.is_playing
 
-
-def test_parameters_are_set_refused_and_followed(page: Page, player: LivePlayer) -> None:
-    parameters = cast(Parameters, player.parameters)
-    corners = page.controls.handle("klt", "n_corners")
-    corners.value = 300
-    page.flush()
-    assert parameters.config.klt.n_corners == 300
-    assert page.message.content.count("klt") == 0
-
-    corners.value = 1
-    page.flush()
-    assert "klt.n_corners=1" in page.message.content
-    assert (parameters.config.klt.n_corners, corners.value) == (300, 300)
-
-    page.controls.handle("window", "n_links").value = 1  # not applied yet
-    parameters.set({"klt.n_corners": 250})  # by someone else
-    assert corners.value == 250
-    assert page.controls.handle("window", "n_links").value == 1
-    page.flush()
-    assert (parameters.config.klt.n_corners, parameters.config.window.n_links) == (250, 1)
-
-
-def wall(n_frames: int) -> Held:
-    """Return what a stereo camera sees that moves along a wall."""
-    camera = PinholeCamera(width=320, height=240, fx=250.0, fy=250.0, cx=159.5, cy=119.5)
-    pair = tuple(Calibration.from_camera(camera, baseline=b) for b in (0.0, 0.1))
-    info = RecordingInfo(name="wall", sensor="stereo", calibrations=pair, n_images=n_frames)
-    noise = np.random.default_rng(0).integers(0, 256, (240, 420)).astype(np.float32)
-    texture = cv2.normalize(cv2.GaussianBlur(noise, None, 2.0), None, 0, 255, cv2.NORM_MINMAX)  # type: ignore[call-overload]
-    items = []
-    for index in range(n_frames):
-        for stream, start in enumerate((3 * index, 3 * index + 8)):
-            load = partial(np.copy, texture[:, start : start + 320].astype(np.uint8))
-            items.append(StampedImage(stream=stream, stamp_ns=index * PERIOD_NS, load=load))
-    return Held(info=info, items=items)
+        page.controls.handle("klt", "n_corners").value = 250
+        page.controls.flush()
+        assert player.config.klt.n_corners == 250
+        page.controls.handle("klt", "n_corners").value = 123  # not applied yet
+        player.parameters.set({"window.n_links": 1})  # by someone else
+        assert page.controls.handle("window", "n_links").value == 1
+        assert page.controls.handle("klt", "n_corners").value == 123
+        page.controls.handle("klt", "n_corners").value = -1
+        page.controls.flush()
+        assert "klt.n_corners=-1" in page.state.content
+        assert (player.config.klt.n_corners, player.config.window.n_links) == (250, 1)
 
 
 def test_a_run_is_shown_as_a_recording_is(tmp_path: Path) -> None:
-    source: Source = wall(4)
+    source = SyntheticRecording("driving", "stereo", n_frames=4, scale=0.3)
     odometry = LiveOdometry(source, max_waiting=100)
     shown = odometry.viewer = LivePlayer(source, odometry.parameters)
     odometry.run(tmp_path, outputs=RunOutputs(report=False))
