@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import gvo
-from gvo.io.recording import Source
+from gvo.io.recording import Sensor, Source
 from tests.worlds import rendered
 
 KITTI = "kitti_06_start"
@@ -35,7 +35,11 @@ LIMITS: dict[str, tuple[float, float, dict[str, float]]] = {
     HAND: (0.0019, 0.00042, {"gain": 0.5}),
     HAND_RGBD: (0.0022, 0.00046, {"gain": 0.5}),
 }
-N_FRAMES = {DRIVE: 50, HAND: 60, HAND_RGBD: 60}
+RENDERED: dict[str, tuple[str, Sensor, int]] = {
+    DRIVE: ("driving", "stereo", 50),
+    HAND: ("handheld", "stereo", 60),
+    HAND_RGBD: ("handheld", "rgbd", 60),
+}
 SEED = 7
 
 
@@ -44,11 +48,11 @@ def recording(request: pytest.FixtureRequest) -> Callable[[str], Source]:
     """Return a function that opens a recorded start, or skips, or renders one."""
 
     def read(name: str) -> Source:
-        if name not in N_FRAMES:
+        if name not in RENDERED:
             folder: Path = request.getfixturevalue("gvo_data")
             return gvo.open_recording(folder / name)
-        world, sensor = name.split()
-        return rendered(world, sensor, n_frames=N_FRAMES[name], seed=SEED)
+        world, sensor, n_frames = RENDERED[name]
+        return rendered(world, sensor, n_frames=n_frames, seed=SEED)
 
     return read
 
@@ -97,7 +101,7 @@ def exceeded(name: str, raw: gvo.Evaluation, smoothed: gvo.Evaluation) -> list[s
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[] if name in N_FRAMES else [pytest.mark.recorded])
+        pytest.param(name, marks=[] if name in RENDERED else [pytest.mark.recorded])
         for name in LIMITS
     ],
 )

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from gvo.errors import RecordingError
 from gvo.io.recording import RecordingInfo, Source
 from gvo.testing.faults import Fault, FaultyImage, Pixels
+from gvo.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -200,8 +200,8 @@ def stamps_of_arrival(sigma_s: float, **options: Any) -> Restamped:
 class Miscalibrated(Fault):
     """K and P times a factor each, for the whole recording."""
 
-    K: ArrayLike = 1.0
-    P: ArrayLike = 1.0
+    K: FloatArray | float = 1.0
+    P: FloatArray | float = 1.0
 
     def change_info(self, info: RecordingInfo) -> RecordingInfo:
         calibrations = tuple(

@@ -241,12 +241,13 @@ def test_ate_and_rpe_are_those_of_evo(tmp_path: Path) -> None:
     )
     rows = evaluate(*map(read_trajectory, kitti), name="e", align="origin", rpe_delta=3)
     pairs = ["--align_origin", "-d", "3", "-u", "f", "--all_pairs"]
-    for found, program in [
+    programs: list[tuple[float | None, list[str | Path]]] = [
         (rigid.ate_m, ["evo_ape", "tum", *tum, "-a"]),
         (scaled.rpe_m, ["evo_rpe", "tum", *tum, "-as", "-d", "1", "-u", "f"]),
         (rows.ate_m, ["evo_ape", "kitti", *kitti, "--align_origin"]),
         (rows.rpe_deg, ["evo_rpe", "kitti", *kitti, *pairs, "-r", "angle_deg"]),
-    ]:
+    ]
+    for found, program in programs:
         assert found == pytest.approx(run_evo(tmp_path, *program), abs=1e-6)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from gvo._text import visible
+from gvo._text import number_text, visible
 from gvo.errors import ConfigurationError, write_faults
 from gvo.viz.names import PAGES, check_suffix
 
@@ -59,7 +59,9 @@ def _environment() -> Environment:
         keep_trailing_newline=True,
     )
     environment.globals.update(resource=_resource)
-    environment.filters.update(base64=lambda data: b64encode(data).decode(), yaml=_yaml)
+    environment.filters.update(
+        base64=lambda data: b64encode(data).decode(), yaml=_yaml, number=_number
+    )
     return environment
 
 
@@ -71,6 +73,10 @@ def _shown(value: Any) -> Any:  # noqa: ANN401
 def _resource(name: str) -> Markup:
     text = (files("gvo.viz.pages") / name).read_text(encoding="utf-8")
     return Markup(text)  # noqa: S704 - a file of the package
+
+
+def _number(value: str | float | None) -> str:
+    return str(value) if isinstance(value, str | int) else number_text(value)
 
 
 def _yaml(value: Any) -> str:  # noqa: ANN401

@@ -45,23 +45,6 @@ from gvo.viz.report.plots import (
 _TRUTH_PLOTS = ("errors_over_time", "errors_over_distance", "drift", "covariance")
 _LOOP_COLUMNS = ("at [s]", "place of [s]", "inliers", "residual", "why refused")
 _MAX_LOOPS = 20
-_ERROR_COLUMNS = {
-    "ate_m": "ATE RMSE [m]",
-    "rpe_m": "RPE [m]",
-    "rpe_deg": "RPE [deg]",
-    "t_pct": "t_err [%]",
-    "r_deg_per_100m": "r_err [deg/100 m]",
-}
-_NEES_COLUMNS = {
-    "motion": "motion",
-    "n": "pairs",
-    "error_m": "error [m]",
-    "error_deg": "error [deg]",
-    "nees_translation": "NEES translation",
-    "nees_rotation": "NEES rotation",
-    "nees": "both",
-    "chance": "by chance",
-}
 
 
 def write_comparison_report(
@@ -245,8 +228,6 @@ def _first_ns(record: RunRecord) -> int:
 def _words(record: RunRecord) -> dict[str, Any]:
     """Return what the page of a run says beside its plots."""
     summary = record.summary
-    covariances = [_nees_row(row) for row in summary.get("covariances", ())]
-    errors = [_error_row(row) for row in summary.get("errors", ())]
     return {
         "title": f"gvo: {record.name}",
         "name": record.name,
@@ -255,16 +236,12 @@ def _words(record: RunRecord) -> dict[str, Any]:
         "is_finished": record.is_finished,
         "warnings": [str(each) for each in summary.get("warnings", ())],
         "facts": _facts(record),
-        "errors": _table(("estimate", "poses", *_ERROR_COLUMNS.values()), errors),
-        "covariances": _table([*_NEES_COLUMNS.values()], covariances),
+        "errors": summary.get("errors", ()),
+        "covariances": summary.get("covariances", ()),
         "loops": _loops(record.loops, _first_ns(record)),
         "decisions": [str(each) for each in summary.get("decisions", ())],
         "configuration": changes(summary.get("configuration", {}), Config().model_dump()),
     }
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> dict[str, Any] | None:
-    return {"header": header, "rows": rows} if rows else None
 
 
 def _loops(loops: Table, first_ns: int) -> dict[str, Any] | None:
@@ -285,17 +262,6 @@ def _loops(loops: Table, first_ns: int) -> dict[str, Any] | None:
     rows = [[column[index] for column in columns] for index in chosen]
     rest = f"; {n - len(chosen)} more are in loops.csv" if n > len(chosen) else ""
     return {"header": _LOOP_COLUMNS, "rows": rows, "rest": rest}
-
-
-def _error_row(row: Mapping[str, Any]) -> list[str]:
-    texts = [number_text(row.get(key)) for key in _ERROR_COLUMNS]
-    return [str(row.get("name", "")), str(row.get("n", "")), *texts]
-
-
-def _nees_row(row: Mapping[str, Any]) -> list[str]:
-    chance = f"{number_text(row['nees_low'], '.2f')} to {number_text(row['nees_high'], '.2f')}"
-    cells = [number_text(row[key]) for key in [*_NEES_COLUMNS][1:-1]]
-    return [str(row["motion"]), *cells, chance]
 
 
 def _facts(record: RunRecord) -> dict[str, str]:
