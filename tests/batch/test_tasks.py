@@ -175,22 +175,3 @@ def test_a_folder_that_stays_busy_is_a_failure_and_the_other_run_goes_on(
     row = run_task(task_of(bag), options, on_progress=start_another)
     assert "another process is writing this run" in rows[0].reason
     assert (rows[0].status, row.status) == ("failed", "complete")
-
-
-def test_hashes_tell_configs_and_bags_apart(bag: Path, bags: Path, options: TaskOptions) -> None:
-    other = gvo.load_configuration(settings=["window.size=3", "runtime.threads=1"])
-    rows = [
-        run_task(task_of(source, config, folder=str(n)), options)
-        for n, (source, config) in enumerate(
-            [
-                (bag, CONFIG),
-                (bags / "walk0.mcap", CONFIG),
-                (bags / "walk1.mcap", CONFIG),
-                (bag, other),
-            ]
-        )
-    ]
-    assert [row.status for row in rows] == ["complete"] * 4
-    assert rows[0].run_hash == rows[1].run_hash
-    assert len({row.run_hash for row in rows}) == 3
-    assert len({row.configuration_hash for row in rows}) == 2

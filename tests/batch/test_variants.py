@@ -92,11 +92,6 @@ def test_what_is_wrong_with_a_sweep_is_said_in_a_line(sweep: str, said: str) -> 
     assert "\n" not in str(error.value)
 
 
-def test_a_key_is_swept_once() -> None:
-    with pytest.raises(ConfigurationError, match=r"--sweep window\.size: is given twice"):
-        make_variants(sweeps=["window.size=4", "window.n_links=1", " window.size =5"])
-
-
 def test_a_grid_that_has_no_end_is_refused_before_it_is_made() -> None:
     values = ",".join(map(str, range(2, 22)))
     keys = ("window.size", "window.n_links", "ransac.seed", "ransac.min_inliers")

@@ -108,16 +108,6 @@ def test_a_bag_that_is_cut_off_gives_what_it_holds_and_exit_code_3(
         np.testing.assert_array_equal(pixels, Tiny().texture(2 * k))
 
 
-def test_several_bags_become_one_folder(command: Command, tmp_path: Path) -> None:
-    for part in range(2):
-        convert(_noise([10**9 * part + 10**8 * k for k in range(3)]), tmp_path / f"{part}.bag")
-    answer = command("convert", tmp_path / "0.bag", tmp_path / "1.bag", tmp_path / "all")
-    assert answer.code == 0
-    assert [image.stamp_ns for image in _images(tmp_path / "all") if image.stream == 0] == [
-        10**9 * part + 10**8 * k for part in range(2) for k in range(3)
-    ]
-
-
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [

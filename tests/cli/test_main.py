@@ -51,14 +51,6 @@ def test_run_writes_and_prints_errors(command: Command, room_bag: Path, tmp_path
     assert names == {*TABLES, "timings.csv"} | of_graph | shown
 
 
-def test_a_run_without_a_folder_makes_one(command: Command, room_bag: Path, here: Path) -> None:
-    for name in ("gvo-room", "gvo-room-2"):
-        answer = command("run", room_bag, "--no-report", "--duration", "0.1")
-        assert answer.code == 0
-        assert (here / name / "summary.json").is_file()
-    assert f"{name}\n" in answer.out
-
-
 @pytest.mark.parametrize(
     "arguments",
     [

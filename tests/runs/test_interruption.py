@@ -13,7 +13,7 @@ import gtsam
 import pytest
 
 import gvo
-from gvo.errors import OutputError, RunBusyError
+from gvo.errors import OutputError
 from gvo.io.convert.bag_messages import BagWriter
 from gvo.io.edges.opening import open_edges
 from gvo.io.run_folder.reader import read_run
@@ -118,20 +118,6 @@ def test_a_run_that_was_stopped_is_replaced_only_where_that_is_asked_for(
     drive.assert_same(out)
 
 
-def test_a_folder_in_use_is_refused_and_its_run_goes_on(drive: Reference, tmp_path: Path) -> None:
-    refused: list[str] = []
-
-    def start_another(progress: Progress) -> None:
-        if progress.n_done in (1, 4):
-            with pytest.raises(RunBusyError, match="another process is writing") as error:
-                drive.run(tmp_path)
-            refused.append(str(error.value))
-
-    assert drive.run(tmp_path, on_progress=start_another).is_complete
-    assert len(refused) == 2
-    drive.assert_same(tmp_path)
-
-
 @pytest.mark.parametrize("name", ["raw.txt", "smoothed.txt"])
 def test_a_full_disk_leaves_whole_lines(
     drive: Reference, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
@@ -211,20 +197,6 @@ def test_a_graph_optimized_onto_a_full_disk_says_how_many_poses_stand(
     assert caught.value.is_partly
     assert len(gvo.read_trajectory(out / "smoothed.txt")) == n_poses
     assert not list(out.glob("*.new"))
-
-
-def test_a_graph_that_is_interrupted_says_so_beside_the_best_poses(tmp_path: Path) -> None:
-    graph = gtsam.findExampleDataFile("pose3example-grid.txt")  # type: ignore[no-untyped-call]
-
-    def stop(state: str) -> None:
-        if state.startswith("iteration 2"):
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        optimize_edges(open_edges([Path(graph)]), tmp_path, on_step=stop)
-    summary = summary_of(tmp_path)
-    assert (summary["state"], summary["batch"]["iterations"]) == ("interrupted", 2)
-    assert len(gvo.read_trajectory(tmp_path / "smoothed.txt")) == summary["frames"]
 
 
 def test_a_graph_whose_error_still_falls_is_not_complete(

@@ -26,13 +26,10 @@ from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Optimum, Progress
 from tests import faults as made
 from tests.conftest import run_of
-from tests.make.bags import PoseBag
 from tests.make.rendered_walk import (
-    CAMERA,
     GLOBAL,
     N_FRAMES,
     STAMPS_NS,
-    START_NS,
     T_BASE_CAM,
     TRAJECTORIES,
     ate_by_hand,
@@ -149,15 +146,6 @@ def test_a_malformed_recorded_truth_is_a_warning(room: SyntheticRecording, tmp_p
     assert (tmp_path / "summary.json").exists()
 
 
-def test_colour_without_depth_makes_no_frame(room: SyntheticRecording, tmp_path: Path) -> None:
-    lonely = FaultySource(room, made.Dropped(first=2, end=6, every=3, streams=(1,)))
-    result = run_of(lonely, tmp_path)
-    assert result.is_complete
-    assert result.summary["frames"] == 10
-    assert result.summary["unpaired_images"] == 2
-    assert "2 images have no partner" in result.warnings[0]
-
-
 def test_a_run_without_poses_leaves_nothing_also_not_of_an_earlier_one(
     room: SyntheticRecording, tmp_path: Path
 ) -> None:
@@ -230,32 +218,6 @@ def test_the_base_follows_from_the_camera(walk_bag: Path, walk_run: Path, tmp_pa
     assert result.summary["base_frame"] == "base_link"
     assert result.is_complete
     _assert_moved(tmp_path / "out", walk_run, T_BASE_CAM)
-
-
-def _panned(stamps_ns: np.ndarray) -> np.ndarray:
-    """Return T_base_cam of a head that turns to the left, 0.4 rad/s."""
-    angles = 0.4e-9 * (stamps_ns - START_NS)
-    R = Rotation.from_euler("z", angles[:, np.newaxis]).as_matrix()
-    return np.asarray(se3.make_transform(R, np.array([0.1, 0.0, 0.3])) @ T_BASE_CAM)
-
-
-def _on_a_head(path: Path, stamps_ns: np.ndarray) -> PoseBag:
-    bag = PoseBag(path)
-    bag.tf(START_NS, "head", CAMERA, T_BASE_CAM, is_static=True)
-    heads = _panned(stamps_ns) @ np.linalg.inv(T_BASE_CAM)
-    for stamp_ns, T_base_head in zip(stamps_ns.tolist(), heads, strict=True):
-        bag.tf(stamp_ns, "base_link", "head", T_base_head)
-    return bag
-
-
-def test_a_camera_on_a_head_that_turns_is_placed_at_each_stamp(
-    walk_bag: Path, walk_run: Path, tmp_path: Path
-) -> None:
-    bag = _on_a_head(tmp_path / "tf.mcap", truth_stamps(rate_hz=20))
-    source = gvo.open_recording([walk_bag, bag.write()])
-    result = run_of(source, tmp_path / "out", base_frame=find_base_frame(source, "base_link"))
-    assert result.warnings == ()
-    _assert_moved(tmp_path / "out", walk_run, _panned(STAMPS_NS))
 
 
 def test_an_antenna_on_a_lever_arm_gives_the_errors_of_its_place(

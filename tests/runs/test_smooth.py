@@ -216,18 +216,6 @@ def test_what_was_computed_stays_where_the_input_breaks_off(tmp_path: Path) -> N
     assert len(gvo.read_trajectory(tmp_path / "smoothed.txt")) == 8
 
 
-def test_a_graph_that_breaks_off_in_a_line_is_smoothed_up_to_there(tmp_path: Path) -> None:
-    path = tmp_path / "broken.g2o"
-    path.write_bytes(example("pose3example-grid").read_bytes()[:8300])
-    result = optimize_file(path, tmp_path / "out")
-    assert not result.is_complete
-    assert "broken.g2o:70" in result.summary["warnings"][0]
-    assert result.summary["edges"] == 42
-    lines = (tmp_path / "out/smoothed.g2o").read_text().splitlines()
-    edges = [line for line in lines if line.startswith("EDGE")]
-    assert len(edges) == 42
-
-
 def test_an_input_without_poses_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="nothing to smooth"):
         smooth_edges(ListSource([]), tmp_path / "out")

@@ -120,16 +120,6 @@ def changing(name: str) -> Spoilt:
     return Spoilt(change)
 
 
-def fail_with_the_recent_motion(result: Result, prior: MotionPrior | None) -> Result:
-    return result if prior is None or prior.T_recent is None else Failure(reason="odd")
-
-
-def find_the_recent_motion(prior: MotionPrior | None) -> Result:
-    if prior is None or prior.T_recent is None:
-        return Failure(reason="nothing seen")
-    return RelativePose(T_reference_current=prior.T_recent.copy(), covariance=np.eye(6))
-
-
 def raise_on_nothing(_: MotionPrior | None) -> Result:
     raise IndexError("no matches")
 
@@ -200,7 +190,6 @@ def recognize_elsewhere(frontend: KltFrontend, *places: Any) -> Result:
 @pytest.mark.parametrize(
     ("frontend", "reason"),
     [
-        (with_places(describe=None), "of describe and recognize, one needs the other"),
         (with_places(describe=as_large_as_images), r"describe.* gives a place of \d{3,} kB"),
         (with_places(describe=lambda _, it: Scan(it.stamp_ns, np.eye(4))), "without points_cam"),
         (with_places(recognize=lambda *_: Failure(reason="dark")), "in its own place fails: dark"),
@@ -210,13 +199,10 @@ def recognize_elsewhere(frontend: KltFrontend, *places: Any) -> Result:
         (spoil_pose(offset), "with itself and the identity disagree"),
         (spoil_pose(scaled), "holds no rotation"),
         (spoil_pose(lambda T: noisy(T, np.random.default_rng())), "gives another result"),
-        (spoil_covariance(lambda C: -C), "not positive definite"),
         (spoil_covariance(lopsided), "not symmetric"),
         (spoil_found(lambda _: None), "must return RelativePose or Failure, got NoneType"),
         (spoil_found(lambda _: Failure(reason="no idea")), "fails on consecutive.*: no idea"),
         (believing("T_recent"), "^register.* a recent median motion disagree by"),
-        (Spoilt(fail_with_the_recent_motion), "^register.* fails with a recent median.*: odd"),
-        (spoil_failure(find_the_recent_motion), "are registered"),
         (ChangesTheFrame(), "extract changes the frame"),
         (LosesTheStamp(), "must keep the stamp"),
         (ExtractsAtRandom(), "other observations"),
@@ -265,42 +251,6 @@ def test_front_ends_of_other_sensors_are_checked_with_their_own_blank_frame() ->
     check_frontend(ScanFrontend(), scans, blank=Scan(9, None))
     with pytest.raises(ContractError, match="are registered"):
         check_frontend(ScanFrontend(), scans, blank=Scan(9, np.eye(4)))
-
-
-class OffByAFewSigmas(ScanFrontend):
-    """Turns about one axis, and contradicts itself in one respect by so many sigmas."""
-
-    def __init__(self, respect: str, n_sigmas: float) -> None:
-        # What two registrations have different of each other counts in sigmas of both.
-        n_each = n_sigmas if respect == "itself" else np.sqrt(2.0) * n_sigmas
-        self._respect = respect
-        self._error = se3.exp(np.array([0.0, 1e-3 * n_each, 0.0, 0.0, 0.0, 0.0]))
-
-    def register(self, reference: Scan, current: Scan, prior: MotionPrior | None) -> Result:
-        result = super().register(reference, current, prior)
-        is_off = {
-            "itself": reference.stamp_ns == current.stamp_ns,
-            "the way back": reference.stamp_ns > current.stamp_ns,
-            "a prior": prior is not None,
-        }[self._respect]
-        if isinstance(result, Failure) or not is_off:
-            return result
-        return replace(result, T_reference_current=result.T_reference_current @ self._error)
-
-
-@pytest.mark.parametrize(
-    ("respect", "reason"),
-    [
-        ("itself", "with itself and the identity disagree by 5.1 sigma"),
-        ("the way back", "the other way round disagree by 5.1 sigma"),
-        ("a prior", "with and without a prior disagree by 5.1 sigma"),
-    ],
-)
-def test_s_are_let_pass_up_to_five_sigma(respect: str, reason: str) -> None:
-    scans = [Scan(n, se3.exp(np.array([0.0, 0.1 * n, 0.0, 0.0, 0.0, 0.0]))) for n in range(3)]
-    check_frontend(OffByAFewSigmas(respect, 4.9), scans)
-    with pytest.raises(ContractError, match=reason):
-        check_frontend(OffByAFewSigmas(respect, 5.1), scans)
 
 
 @pytest.mark.parametrize(

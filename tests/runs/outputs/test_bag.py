@@ -1,6 +1,5 @@
 """Runs as bags, read back by other programs' readers."""
 
-import errno
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -17,7 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from gvo.errors import RecordingError
 from gvo.geometry.se3 import make_transform
-from gvo.io.convert.bag_messages import BagWriter
 from gvo.io.poses.tf import TfBuffer
 from gvo.runs.outputs.bag import RunBag
 from gvo.runs.outputs.frames import RunFrames
@@ -471,30 +469,6 @@ def test_frames_without_a_registration_are_told_and_have_no_points(tmp_path: Pat
     assert [message.twist.covariance[0] for _, message in odometry] == [-1, -1, -1, -1, 1]
 
 
-def test_an_interrupted_run_leaves_what_was_computed(tmp_path: Path) -> None:
-    path = tmp_path / "new" / "run.bag"
-
-    def run_until_interrupted() -> None:
-        with RunBag(path) as file:
-            file.add_smoothed([_add(file, START_NS)])
-            _add(file, START_NS + 1)
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        run_until_interrupted()
-    messages = read_bag(path)
-    assert len(messages["/gvo/raw/odometry"]) == 2
-    assert len(messages["/gvo/raw/path"][-1][1].poses) == 2
-    assert len(messages["/gvo/smoothed/path"][-1][1].poses) == 1
-
-
-def test_without_a_frame_no_file_is_left_and_closing_twice_does_no_harm(tmp_path: Path) -> None:
-    with RunBag(tmp_path / "run.mcap") as file:
-        assert len(list(tmp_path.iterdir())) == 1
-        file.close()
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
     taken = tmp_path / "taken.mcap"
     taken.write_text("mine")
@@ -512,20 +486,3 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
         _add(file, 2**31 * SECOND_NS)  # the stamp does not fit
     assert [path.name for path in tmp_path.iterdir()] == ["taken.mcap"]
     assert taken.read_text() == "mine"
-
-
-def test_a_full_disk_ends_the_run_with_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file = RunBag(tmp_path / "run.mcap")
-    _add(file, START_NS)
-
-    def refuse(*_: object, **__: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(BagWriter, "write", refuse)
-    with pytest.raises(RecordingError, match=r"run\.mcap: cannot be written: No space left"):
-        _add(file, START_NS + 1)
-    with pytest.raises(RecordingError, match=r"run\.mcap: cannot be written: No space left"):
-        file.close()
-    assert list(tmp_path.iterdir()) == []

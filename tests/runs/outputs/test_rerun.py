@@ -331,14 +331,6 @@ def test_a_file_has_its_name_when_it_is_closed_also_of_an_interrupted_run(tmp_pa
     assert rr.get_global_data_recording() is None
 
 
-@pytest.mark.parametrize("is_faulty", [True, False])
-def test_without_a_frame_no_file_is_left(tmp_path: Path, is_faulty: bool) -> None:
-    with RunRerun(tmp_path / "made.rrd", _CAMERA) as file:
-        if is_faulty:
-            file.add_faulty(FaultyFrame(stamp_ns=1, reason="black"))
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.fixture
 def small_disk() -> Iterator[None]:
     """Let no file grow beyond 100 kB, as a full disk would."""
