@@ -125,17 +125,7 @@ def read_ground_truth(path: str | Path) -> Trajectory:
     TrajectoryError, RecordingError
         When the file holds no poses, or the recording no ground truth.
     """
-    if _is_in_bag(str(path)) or (Path(path).is_dir() and is_bag(Path(path))):
-        return _read_input(str(path)).trajectory
-    path = Path(path)
-    if (path / "groundtruth.txt").is_file():
-        return read_trajectory(path / "groundtruth.txt")
-    if not path.is_dir():
-        return read_trajectory(path)  # of a pipe too
-    truth = open_recording(path).ground_truth()
-    if truth is None:
-        raise TrajectoryError(f"{path}: this recording holds no ground truth")
-    return truth
+    return _read(str(path)).trajectory
 
 
 def read_compared(
@@ -164,18 +154,8 @@ def read_compared(
     TrajectoryError, RecordingError
         When something cannot be read.
     """
-    if _is_in_bag(reference):
-        first = _read_input(reference)
-    else:
-        truth = read_ground_truth(reference)
-        is_recording = Path(reference).is_dir()
-        first = Poses(
-            trajectory=truth,
-            child_frame=_CAMERA if is_recording else "",
-            warning=_repeats(reference, truth),
-            is_of_camera=is_recording,
-        )
-    found = [_read_input(text, first) for text in estimates]
+    first = _read(reference)
+    found = [_read(text, first) for text in estimates]
     warnings = [one.warning for one in (first, *found) if one.warning]
     names = _short_names(estimates, [one.name for one in found])
     trajectories = {name: one.trajectory for name, one in zip(names, found, strict=True)}
@@ -190,22 +170,38 @@ def _is_in_bag(text: str) -> bool:
     return bool(mark) and exists(Path(path))
 
 
-def _read_input(text: str, reference: Poses | None = None) -> Poses:
-    """Read poses from a file, or out of a bag; where tf can, as those of the reference's frame."""
-    if not _is_in_bag(text):
-        trajectory = read_trajectory(text)
-        warning = _repeats(text, trajectory)
-        return Poses(trajectory=trajectory, name=Path(text).stem, warning=warning)
+def _read(text: str, reference: Poses | None = None) -> Poses:
+    """Read poses; out of a bag, where its tf can, as those of the reference's frame."""
+    if _is_in_bag(text):
+        return _read_of_bag(text, reference)
+    path = Path(text)
+    is_recording = path.is_dir()
+    if (path / "groundtruth.txt").is_file():
+        trajectory = read_trajectory(path / "groundtruth.txt")
+    elif is_recording:
+        truth = open_recording(path).ground_truth()
+        if truth is None:
+            raise TrajectoryError(f"{path}: this recording holds no ground truth")
+        trajectory = truth
+    else:
+        trajectory = read_trajectory(path)  # of a pipe too
+    return Poses(
+        trajectory=trajectory,
+        name=path.stem,
+        child_frame=_CAMERA if is_recording else "",
+        warning=_repeats(text, trajectory),
+        is_of_camera=is_recording,
+    )
+
+
+def _read_of_bag(text: str, reference: Poses | None) -> Poses:
     path, _, what = (text, "", "") if exists(Path(text)) else text.partition(_MARK)
     reader = BagReader(Path(path))
     poses = _read_in_bag(reader, what, path)
     child = _camera_frame(path) if poses.is_of_camera else poses.child_frame
-    found = replace(
-        poses,
-        name=what or Path(path).stem,
-        child_frame=_OWN_FRAME.sub("", child),
-        warning=reader.damage,
-    )
+    plain = _OWN_FRAME.sub("", child)
+    name = what or Path(path).stem
+    found = replace(poses, name=name, child_frame=plain, warning=reader.damage)
     if reference is None or not reference.child_frame or not child:
         return found
     if reference.is_of_camera and found.is_of_camera:
