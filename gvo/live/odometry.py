@@ -373,7 +373,6 @@ class WaitingPairs:
             )
         self._max_waiting, self._max_lag_s = max_waiting, max_lag_s
         self._items: deque[Paired] = deque()
-        self._n_pairs = 0
         self._newest_ns, self._newest_s = 0, 0.0  # its stamp, and when it came
         self._taken_s: float | None = None
         self._tracking_s: deque[float] = deque([0.0], maxlen=_N_TIMED)  # of the last pairs
@@ -391,12 +390,21 @@ class WaitingPairs:
             self._items.append(item)
             if not isinstance(item, FaultyFrame):
                 self.on_pair(item[0].stamp_ns)
-                self._n_pairs += 1
                 self._newest_ns, self._newest_s = item[0].stamp_ns, time.perf_counter()
-                limit = self._max_waiting if self._is_tied else _MAX_BEFORE_TIED
-                if self._n_pairs > limit:
-                    self._drop_oldest(limit)
+                self._drop_oldest()
             self._changed.notify()
+
+    def _drop_oldest(self) -> None:
+        """Replace the oldest pair by a faulty frame where too many wait."""
+        limit = self._max_waiting if self._is_tied else _MAX_BEFORE_TIED
+        pairs = [
+            (index, item)
+            for index, item in enumerate(self._items)
+            if not isinstance(item, FaultyFrame)
+        ]
+        if len(pairs) > limit:
+            index, oldest = pairs[0]
+            self._items[index] = self._dropped(oldest, f"{limit} pairs wait (--queue)")
 
     def do(self, action: Callable[[], object]) -> None:
         """Have the tracking thread call `action` before it takes the next pair."""
@@ -429,10 +437,10 @@ class WaitingPairs:
             start_s = time.perf_counter()
             with self._changed:
                 self._changed.wait_for(lambda: self._actions or self._items or self._is_closed)
-                action = self._actions.popleft() if self._actions else None
-            self._waited_s += time.perf_counter() - start_s
-            if action is None:
-                return self._take()
+                self._waited_s += time.perf_counter() - start_s
+                if not self._actions:
+                    return self._take()
+                action = self._actions.popleft()
             action()
 
     def take_waited_s(self) -> float:
@@ -441,24 +449,23 @@ class WaitingPairs:
         return waited_s
 
     def _take(self) -> Paired | None:
-        with self._changed:
-            if not self._items:
-                if self._fault is not None:
-                    raise self._fault
-                return None
-            item = self._items.popleft()
-            if isinstance(item, FaultyFrame):
-                return item
-            self._n_pairs -= 1
-            now_s = time.perf_counter()
-            waited_s = now_s - self._newest_s + 1e-9 * (self._newest_ns - item[0].stamp_ns)
-            lag_s = waited_s + max(self._tracking_s)
-            may_drop = self._is_tied and self._n_pairs > 0 and self._max_lag_s is not None
-            if may_drop and lag_s > (self._max_lag_s or 0.0):
-                self._taken_s = None
-                return self._dropped(item, f"its pose would be {lag_s:.2f} s late (--max-lag)")
-            self._taken_s = now_s
+        if not self._items:
+            if self._fault is not None:
+                raise self._fault
+            return None
+        item = self._items.popleft()
+        if isinstance(item, FaultyFrame):
             return item
+        now_s = time.perf_counter()
+        waited_s = now_s - self._newest_s + 1e-9 * (self._newest_ns - item[0].stamp_ns)
+        lag_s = waited_s + max(self._tracking_s)
+        is_newest = all(isinstance(each, FaultyFrame) for each in self._items)
+        is_late = self._max_lag_s is not None and lag_s > self._max_lag_s
+        if is_late and self._is_tied and not is_newest:
+            self._taken_s = None
+            return self._dropped(item, f"its pose would be {lag_s:.2f} s late (--max-lag)")
+        self._taken_s = now_s
+        return item
 
     def through(self, items: Iterable[Paired]) -> Iterator[Paired]:
         """Receive items in another thread, and yield what `take` returns."""
@@ -477,14 +484,6 @@ class WaitingPairs:
             self.close(error)
         finally:
             self.close()  # whatever happened, nobody waits for more
-
-    def _drop_oldest(self, limit: int) -> None:
-        """Replace the oldest pair by a faulty frame."""
-        for index, item in enumerate(self._items):
-            if not isinstance(item, FaultyFrame):
-                self._items[index] = self._dropped(item, f"{limit} pairs wait (--queue)")
-                self._n_pairs -= 1
-                return
 
     def _dropped(self, pair: Pair, reason: str) -> FaultyFrame:
         self.n_dropped += 1

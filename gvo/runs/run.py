@@ -138,7 +138,7 @@ def run_recording(
     )
     with ExitStack() as stack, ExitStack() as files:
         stack.enter_context(written_alone(Path(out), force=force))
-        others, notes = outputs.open(loop, files)
+        others = outputs.open(loop, files)
         folder = files.enter_context(RunFolder(Path(out)))
         stack.push(partial(_draw_if_interrupted, Path(out), outputs))
         with RunningSummary(loop, folder, identity, on_progress) as summary:
@@ -150,7 +150,7 @@ def run_recording(
         _LOGGER.debug("all frames are tracked; comparing and writing the summary")
         is_asked = ground_truth is not None
         identity = {GLOBAL: optimum_json(optimum), "run": identity}
-        result = _conclude(loop, folder, identity, truth, notes, faults, is_asked=is_asked)
+        result = _conclude(loop, folder, identity, truth, faults, is_asked=is_asked)
     if on_written is not None:
         on_written()
     return drawn(result, Path(out), plots=outputs.plots) if outputs.report else result
@@ -200,7 +200,6 @@ def _conclude(
     folder: RunFolder,
     known: dict[str, Any],
     truth: Truth | Failure,
-    notes: list[str],
     faults: list[str],
     *,
     is_asked: bool,
@@ -213,7 +212,7 @@ def _conclude(
         )
     compared = _compare(truth, folder, loop)
     warnings = [*loop.statistics.warnings(), *_warnings_of_camera(loop.source)]
-    warnings += [*notes, *faults, *_warnings_of_truth(compared)]
+    warnings += [*faults, *_warnings_of_truth(compared)]
     evaluations: tuple[Evaluation, ...] = ()
     if isinstance(compared, TruthComparison):
         folder.write_truth(compared.truth.trajectory)

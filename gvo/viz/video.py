@@ -31,13 +31,13 @@ def open_sink(path: Path) -> Film | PngFolder:
     Parameters
     ----------
     path : Path
-        Ends in `.webm` or `.mp4`: a film, or PNG files in a folder beside it where there is no
-        encoder. Without a suffix, or an existing folder: a folder of PNG files.
+        Ends in `.webm` or `.mp4`: a film. Without a suffix, or an existing folder: a folder of PNG
+        files.
 
     Raises
     ------
     ConfigurationError
-        When the path ends otherwise.
+        When the path ends otherwise, or there is no encoder.
     RecordingError
         When it exists or cannot be written.
     """
@@ -51,11 +51,13 @@ def open_sink(path: Path) -> Film | PngFolder:
         )
     if path.exists():
         raise RecordingError(f"{path}: exists already; give another path or remove it")
-    if has_encoder(suffix):
-        return Film(path)
-    folder = path.with_name(f"{path.stem}_frames")
-    reason = f"{path}: there is no encoder for {suffix} here"
-    return PngFolder(folder, decisions=(f"{reason}: PNG files in {folder} instead",))
+    with tempfile.TemporaryDirectory(prefix="gvo-film-") as folder:
+        if _open_writer(Path(folder) / f"film{suffix}", _FALLBACK_HZ, (64, 64)) is None:
+            raise ConfigurationError(
+                f"{path}: OpenCV has no encoder for {suffix} here; give the name of a folder for "
+                "PNG files"
+            )
+    return Film(path)
 
 
 class Film:
@@ -63,7 +65,6 @@ class Film:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.decisions: tuple[str, ...] = ()
         self._waiting: list[ImageArray] = []
         self._stamps_ns: list[int] = []
         self._writer: cv2.VideoWriter | None = None
@@ -129,9 +130,8 @@ def count_pictures(path: Path) -> int:
 class PngFolder:
     """A folder of numbered PNG files, each written as it comes."""
 
-    def __init__(self, path: Path, decisions: tuple[str, ...] = ()) -> None:
-        self.path, self.decisions = path, decisions
-        self._n = 0
+    def __init__(self, path: Path) -> None:
+        self.path, self._n = path, 0
         with write_faults(RecordingError, path):
             path.mkdir(parents=True, exist_ok=True)
             is_empty = next(path.iterdir(), None) is None
@@ -149,12 +149,6 @@ class PngFolder:
         if self._n == 0:
             with write_faults(RecordingError, self.path):
                 self.path.rmdir()
-
-
-def has_encoder(suffix: str) -> bool:
-    """Tell whether films of a suffix of `CODECS` can be written."""
-    with tempfile.TemporaryDirectory(prefix="gvo-film-") as folder:
-        return _open_writer(Path(folder) / f"film{suffix}", _FALLBACK_HZ, (64, 64)) is not None
 
 
 def rate_of(stamps_ns: Sequence[int]) -> float:

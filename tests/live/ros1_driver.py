@@ -12,6 +12,7 @@ sys.path += ["/usr/lib/python3/dist-packages", str(Path(__file__).parents[2])]
 import rospy
 from dynamic_reconfigure.client import Client
 from genpy import Message
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import Image, PointCloud2
 from std_srvs.srv import Trigger
@@ -106,12 +107,74 @@ def send_hostile(images: Any, stamp_ns: int) -> None:
         images.publish(Garbage(data))
 
 
+class SetPoseRequest(Message):  # type: ignore[misc]
+    """robot_localization is not in Debian."""
+
+    _type = "robot_localization/SetPoseRequest"
+    _md5sum = ""
+    _slot_types = ("geometry_msgs/PoseWithCovarianceStamped",)
+    __slots__ = ("pose",)
+
+    def serialize(self, buffer: Any) -> None:
+        self.pose.serialize(buffer)
+
+
+class SetPoseResponse(Message):  # type: ignore[misc]
+    _type = "robot_localization/SetPoseResponse"
+    _md5sum = ""
+    __slots__ = ()
+
+    def deserialize(self, _: bytes) -> "SetPoseResponse":
+        return self
+
+
+class SetPose:
+    _type = "robot_localization/SetPose"
+    _md5sum = "4f3e0bbe7a24e1f929488cd1970222d3"
+    _request_class = SetPoseRequest
+    _response_class = SetPoseResponse
+
+
+def set_poses() -> None:
+    pose = PoseWithCovarianceStamped()
+    pose.pose.pose.orientation.w = 1.0
+    for frame in ("map", "elsewhere"):
+        pose.header.frame_id = frame
+        rospy.ServiceProxy("/gvo/set_pose", SetPose)(SetPoseRequest(pose=pose))
+
+
+def reconfigure() -> dict[str, Any]:
+    """Change parameters by the client of dynamic_reconfigure; return what it tells of them."""
+    client = Client("/gvo", timeout=PATIENCE_S)
+    first = client.get_configuration(timeout=PATIENCE_S)
+    listed = {one["name"]: one for one in client.get_parameter_descriptions()}
+    answers = [
+        client.update_configuration({name: value})[asked]
+        for name, value, asked in (
+            ("klt__n_corners", 120, "klt__n_corners"),
+            ("klt__n_corners", -1, "klt__n_corners"),
+            ("camera__readout_ms", 3.5, "camera__readout_ms__null"),
+            ("camera__readout_ms__null", True, "camera__readout_ms__null"),
+            ("features__kind", "sift", "features__kind"),
+            ("features__kind", "orb", "features__kind"),
+        )
+    ]
+    return {
+        "n": len(first) - 1,  # but the groups
+        "groups": [*client.get_group_descriptions()["groups"]],
+        "size": listed["window__size"],
+        "readout": listed["camera__readout_ms"],
+        "kind": listed["features__kind"]["edit_method"],
+        "answers": answers,
+    }
+
+
 def interfere(index: int, stamp_ns: int, images: Any) -> None:
-    """Change a parameter, send what is no image, reset: each once."""
+    """Set the pose, change parameters, send what is no image, reset: each once."""
+    if index == 5:
+        set_poses()
     if index == 10:
-        client = Client("/gvo", timeout=PATIENCE_S)
-        assert client.update_configuration({"klt__n_corners": 120})["klt__n_corners"] == 120
-        assert client.update_configuration({"klt__n_corners": -1})["klt__n_corners"] == 120
+        tell(f"parameters {json.dumps(reconfigure())}")
     if index == 20:
         send_hostile(images, stamp_ns + 1000)
     if index == 30:

@@ -75,22 +75,9 @@ def test_matches_without_a_place_are_left_out_and_far_ones_do_no_harm() -> None:
     sound = ((20.0, 30.0), (60.0, 35.0), True)
     broken = [((np.nan, 1.0), (5.0, 5.0), True), ((5.0, 5.0), (np.inf, 5.0), False)]
     far = [((1e9, -1e9), (1.1e9, -1e9), True)]
-    np.testing.assert_array_equal(_draw([sound, *broken, *far]), _draw([sound]))
-
-
-def test_the_image_is_left_as_it_was_and_shown_where_nothing_matches() -> None:
     before = _GREY.copy()
-    np.testing.assert_array_equal(_draw([]), _plain())
-    _draw([((20.0, 30.0), (60.0, 35.0), False)])
+    np.testing.assert_array_equal(_draw([sound, *broken, *far]), _draw([sound]))
     np.testing.assert_array_equal(_GREY, before)
-
-
-def test_text_stands_in_the_upper_left_corner() -> None:
-    nothing, inliers = np.zeros((0, 2)), np.zeros(0, dtype=np.bool_)
-    lines = ["ok: 1", "\N{GREEK SMALL LETTER TAU}"]
-    picture = draw_matches(_GREY, nothing, nothing, inliers, lines=lines)
-    assert picture[:40, :50].max() > 200
-    np.testing.assert_array_equal(picture[45:], _plain()[45:])
 
 
 def test_a_coloured_image_and_unequal_counts_are_refused() -> None:
@@ -152,7 +139,7 @@ def test_the_disparity_is_drawn_from_the_left_to_the_right_image_in_the_colour_o
     np.testing.assert_allclose(stereo[120, 370].astype(int), expected, atol=24)
 
 
-@pytest.mark.parametrize("max_width", [640, 800, 1280])
+@pytest.mark.parametrize("max_width", [640, 1280])
 def test_all_pictures_of_a_camera_have_one_even_size(max_width: int) -> None:
     faulty = FaultyFrame(stamp_ns=1, reason="image_0/000001.png: " + "cannot be read, " * 40)
     for camera in (_STEREO, _RGBD):
@@ -198,15 +185,6 @@ def test_nearer_is_never_darker(near: float, factor: float, depths: list[float])
     assert np.ptp(table().astype(int).sum(axis=1)[[0, -1]]) > 100
 
 
-def test_each_status_has_a_badge_of_its_own() -> None:
-    badges = [
-        compose_overlay(_pair(), _result([], [], status=status), _STEREO)[:24, :110].tobytes()
-        for status in (Status.OK, Status.COASTING, Status.LOST, Status.RESUMED)
-    ]
-    badges.append(compose_faulty(FaultyFrame(stamp_ns=1, reason=""), _STEREO)[:24, :110].tobytes())
-    assert len(set(badges)) == 5
-
-
 def test_a_loop_has_its_mark_in_the_upper_right_corner_and_leaves_the_stamp_readable() -> None:
     loop = loop_of(10**18, 10**18 - 98_765_400_000_000)
     plain = _result([], [], status=Status.RESUMED)
@@ -233,8 +211,10 @@ def test_images_of_another_size_and_a_pair_without_a_baseline_are_refused() -> N
         compose_overlay(_pair(), _result([], []), _STEREO, max_width=600)
 
 
-@given(text=st.text(max_size=80), n_pixels=st.integers(30, 400))
-def test_a_shortened_text_fits_and_is_a_beginning(text: str, n_pixels: int) -> None:
+@pytest.mark.parametrize("n_pixels", [30, 100, 400])
+def test_a_shortened_text_fits_and_is_a_beginning(n_pixels: int) -> None:
+    text = "image_0/000001.png: truncated \N{GREEK SMALL LETTER TAU}" * 2
     short = shortened(text, n_pixels)
     assert text_width(short) <= n_pixels
-    assert short == text or text.startswith(short.removesuffix("..."))
+    assert text.startswith(short.removesuffix("..."))
+    assert shortened(short, n_pixels) == short

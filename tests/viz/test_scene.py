@@ -48,7 +48,7 @@ def test_a_track_is_sorted_and_holds_the_last_pose_of_each_stamp(stamps_ns: list
         assert (None if before is None else before.stamp_ns) == max(earlier, default=None)
 
 
-@given(st.integers(1, 400), st.integers(2, 40))
+@given(st.integers(1, 60), st.integers(2, 20))
 def test_a_thinned_path_keeps_its_poses_while_it_grows(n: int, n_most: int) -> None:
     track = Track()
     for stamp_ns in range(n):

@@ -69,7 +69,7 @@ class RunOutputs:
             if not force:
                 check_new(self.plots, otherwise="--force to replace its plots")
 
-    def open(self, loop: RunLoop, stack: ExitStack) -> tuple[list[FileOutput], list[str]]:
+    def open(self, loop: RunLoop, stack: ExitStack) -> list[FileOutput]:
         """Open the files that are written as the run goes.
 
         Parameters
@@ -81,9 +81,7 @@ class RunOutputs:
 
         Returns
         -------
-        outputs : list of FileOutput
-        warnings : list of str
-            Where another file is written than asked for, a line each.
+        list of FileOutput
 
         Raises
         ------
@@ -93,7 +91,6 @@ class RunOutputs:
             When a file cannot be written.
         """
         outputs: list[FileOutput] = []
-        warnings: list[str] = []
         if self.plots is not None:
             with write_faults(RecordingError, self.plots):
                 self.plots.mkdir(parents=True, exist_ok=True)
@@ -109,14 +106,13 @@ class RunOutputs:
             from gvo.runs.outputs.video import RunOverlay
 
             film = RunOverlay(self.overlay, loop.source.info.camera)
-            warnings += film.decisions
             outputs.append(stack.enter_context(film))
         if self.rerun is not None:
             from gvo.runs.outputs.rerun import RunRerun
 
             rerun = RunRerun(self.rerun, loop.source.info.camera, names, config=loop.config)
             outputs.append(stack.enter_context(rerun))
-        return outputs, warnings
+        return outputs
 
 
 def name_frames(

@@ -33,19 +33,14 @@ class RunOverlay(FileOutput):
     ----------
     path : Path
         `.webm`: VP8, for browsers; `.mp4`: MPEG-4, for players; without a suffix: a folder of
-        PNG files, as where there is no encoder (see `decisions`).
+        PNG files.
     camera : StereoCamera or PinholeCamera
         Of the recording.
-
-    Attributes
-    ----------
-    decisions : tuple of str
-        What is written otherwise than asked for, a line each.
 
     Raises
     ------
     ConfigurationError
-        When the path ends otherwise.
+        When the path ends otherwise, or there is no encoder.
     RecordingError
         When the path exists or cannot be written; so do all methods.
     """
@@ -54,7 +49,6 @@ class RunOverlay(FileOutput):
         self._camera = camera
         self._max_width = film_width(camera)
         self._sink = open_sink(Path(path))
-        self.decisions = self._sink.decisions
         self._n = 0
         self._loops: tuple[Loop, ...] = ()
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="overlay")
