@@ -6,7 +6,7 @@ import struct
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -213,12 +213,17 @@ def write_image(writer: MessageWriter, topic: str, pixels: NDArray[Any], header:
 
 
 def write_compressed(
-    writer: MessageWriter, topic: str, pixels: NDArray[np.uint8], header: Header
+    writer: MessageWriter,
+    topic: str,
+    pixels: ImageArray,
+    header: Header,
+    suffix: Literal[".png", ".jpg"] = ".png",
 ) -> None:
-    """Write an image, uint8 (h, w) or BGR (h, w, 3), as PNG to a topic ending in `/compressed`."""
+    """Write an image, uint8 (h, w) or BGR (h, w, 3), as a file; the topic ends in `/compressed`."""
     encoding = "mono8" if pixels.ndim == 2 else "bgr8"
     kind = f"{encoding}; png compressed {'' if pixels.ndim == 2 else encoding}"
-    _write(writer, topic, kind, encode_image(pixels, ".png"), header)
+    kind = kind if suffix == ".png" else "jpeg"
+    _write(writer, topic, kind, encode_image(pixels, suffix), header)
 
 
 def write_compressed_depth(
@@ -241,11 +246,6 @@ def write_compressed_depth(
     else:
         data = _DEPTH_HEADER + encode_image(counts, ".png")
         _write(writer, topic, "16UC1; compressedDepth", data, header)
-
-
-def write_picture(writer: MessageWriter, topic: str, header: Header, image: ImageArray) -> None:
-    """Write a picture, uint8 (h, w, 3) in BGR order, as JPEG to a topic ending in `/compressed`."""
-    _write(writer, topic, "jpeg", encode_image(image, ".jpg"), header)
 
 
 def _write(writer: MessageWriter, topic: str, kind: str, data: bytes, header: Header) -> None:

@@ -43,24 +43,6 @@ def append_whole(file: io.FileIO, data: bytes) -> None:
         raise
 
 
-class LineFile:
-    """A text file that grows by whole lines after its header; replaces an existing one."""
-
-    def __init__(self, path: Path, header: str) -> None:
-        self.path = path
-        path.unlink(missing_ok=True)  # a link there may lead out of the folder
-        self._file = io.FileIO(path, "wb")
-        append_whole(self._file, header.encode())
-
-    def write(self, lines: str) -> None:
-        """Append lines; where they cannot be written, none of them."""
-        append_whole(self._file, lines.encode())
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-
 def replace_text(path: Path, text: str) -> None:
     """Replace a text file atomically."""
     replace_bytes(path, text.encode())

@@ -18,7 +18,7 @@ import numpy as np
 from gvo._text import visible
 from gvo.errors import OutputError, RunBusyError, write_faults
 from gvo.geometry import se3
-from gvo.io.run_folder.line_file import LineFile, check_folder, replace_text
+from gvo.io.run_folder.line_file import append_whole, check_folder, replace_text
 from gvo.trajectory.formats import (
     COVARIANCE_HEADER,
     format_covariance_line,
@@ -183,7 +183,7 @@ class RunFolder(AbstractContextManager["RunFolder"]):
     ) -> None:
         self.path = path
         self._is_writable = True
-        self._files: dict[str, LineFile] = {}
+        self._files: dict[str, io.FileIO] = {}
         with ExitStack() as stack, self._refused_on_error(path):
             path.mkdir(parents=True, exist_ok=True)
             covariances = (f"{name}_covariance.csv" for name in (*TRAJECTORIES, GLOBAL))
@@ -211,15 +211,17 @@ class RunFolder(AbstractContextManager["RunFolder"]):
     def _open(self, name: str, header: str) -> None:
         if name in self._files:
             self._files[name].close()
-        self._files[name] = LineFile(self.path / name, header)
+        path = self.path / name
+        path.unlink(missing_ok=True)  # a link there may lead out of the folder
+        self._files[name] = io.FileIO(path, "wb")
+        append_whole(self._files[name], header.encode())
 
     def _open_covariances(self, name: str) -> None:
         self._open(f"{name}_covariance.csv", f"{COVARIANCE_HEADER}\n")
 
     def _write(self, name: str, lines: str) -> None:
-        file = self._files[name]
-        with self._refused_on_error(file.path):
-            file.write(lines)
+        with self._refused_on_error(self.path / name):
+            append_whole(self._files[name], lines.encode())
 
     def add_frame(self, frame: object, result: FrameResult) -> None:
         """Write the result of a frame."""

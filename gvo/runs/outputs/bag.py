@@ -61,7 +61,7 @@ from gvo.io.convert.bag_messages import (
     BagWriter,
     Header,
     MessageWriter,
-    write_picture,
+    write_compressed,
     write_transforms,
 )
 from gvo.io.run_folder.line_file import PartFile
@@ -248,7 +248,7 @@ class RunMessages:
             found = placed_matches(result)
             matches = found.pixels_reference, found.pixels_current, found.inliers
             picture = draw_matches(image, *matches, lines=seen.caption)
-            write_picture(self._writer, _PICTURE, header, picture)
+            write_compressed(self._writer, _PICTURE, picture, header, ".jpg")
 
     def write_paths(self) -> None:
         """Write the paths so far, of all poses."""
