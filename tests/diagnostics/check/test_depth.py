@@ -1,4 +1,4 @@
-"""The measures of images and of registration against what was put in."""
+"""Where depth lies in the image of colour, against what was put in."""
 
 from __future__ import annotations
 
@@ -10,15 +10,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from gvo.config import Config
-from gvo.diagnostics.check.depth import Misregistration, depth_steps, estimate_misregistration
-from gvo.diagnostics.check.images import blur_sigma_px, n_torn_rows
-from gvo.diagnostics.check.stereo import FreeMatcher, row_error
+from gvo.diagnostics.check.depth import Misregistration, estimate_misregistration
 from gvo.types import Failure, RgbdFrame
-from tests.diagnostics.check.planted import render
 
 
 def squares(seed: int, *, size: int = 240) -> tuple[Any, Any]:
@@ -88,15 +82,11 @@ def test_the_place_of_depth_in_the_image_is_measured(
         assert found.rms_px == pytest.approx(math.hypot(*shift_px), abs=0.6)
 
 
-def unrelated(frame: RgbdFrame) -> dict[str, Any]:
-    rng = np.random.default_rng(frame.stamp_ns)
-    return {"image": rng.integers(0, 256, frame.image.shape, dtype=np.uint8)}
-
-
 def at_the_border(frame: RgbdFrame) -> dict[str, Any]:
     depth = np.full(frame.depth.shape, 3.0, np.float32)
     depth[:, 2:6] = 1.0  # a mast, nearer to the border than the search reaches
-    return unrelated(frame) | {"depth": depth}
+    image = np.random.default_rng(frame.stamp_ns).integers(0, 256, depth.shape, dtype=np.uint8)
+    return {"image": image, "depth": depth}
 
 
 def of_a_wall(frame: RgbdFrame) -> dict[str, Any]:
@@ -108,53 +98,3 @@ def test_depth_that_the_image_does_not_show_gives_no_answer(
     change: Callable[[RgbdFrame], dict[str, Any]],
 ) -> None:
     assert isinstance(estimate_misregistration(changed(change)), Failure)
-
-
-def test_steps_are_the_last_pixels_of_what_is_near_also_across_a_shadow() -> None:
-    depth = np.full((20, 40), 4.0, dtype=np.float32)
-    depth[:, 10:20] = 1.0
-    depth[:, 6:10] = np.nan
-    before, after = depth_steps(depth)
-    assert set(np.nonzero(before)[1]) == {19}
-    assert set(np.nonzero(after)[1]) == {10}
-
-
-@settings(max_examples=20)
-@given(st.floats(1.0, 3.0), st.floats(0.4, 1.0), st.integers(0, 1000))
-def test_blur_is_measured_whatever_the_contrast(sigma: float, contrast: float, seed: int) -> None:
-    grey, _ = squares(seed)
-    blurred = cv2.GaussianBlur(100.0 + contrast * (grey - 100.0), (0, 0), sigma)
-    noise = np.random.default_rng(seed).normal(0, 1, grey.shape)
-    image = np.clip(np.rint(blurred + noise), 0, 255).astype(np.uint8)
-    assert blur_sigma_px(image) == pytest.approx(sigma, rel=0.25, abs=0.2)
-
-
-@given(st.integers(0, 30), st.integers(0, 255))
-def test_torn_rows_are_counted(n_torn: int, value: int) -> None:
-    image = np.random.default_rng(0).integers(0, 256, (30, 40), dtype=np.uint8)
-    image[30 - n_torn :] = value
-    assert n_torn_rows(image) == n_torn
-
-
-@given(st.floats(-5, 5), st.floats(0, 0.8), st.integers(0, 2**32 - 1))
-def test_wrong_matches_do_not_reach_the_row_error(offset: float, sigma: float, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    rows = rng.normal(offset, sigma, 1000)
-    rows[:30] = rng.uniform(-30, 30, 30)
-    left = np.zeros((1000, 2))
-    median_px, spread_px = row_error(np.c_[left, np.zeros(1000), rows])
-    assert median_px == pytest.approx(offset, abs=0.15 * sigma + 0.01)
-    clean = np.percentile(np.abs(rng.normal(offset, sigma, 100_000)), 95)
-    assert spread_px == pytest.approx(clean, rel=0.2, abs=0.1)
-
-
-@pytest.mark.parametrize(("du", "dv"), [(-20.5, 3.75)])
-def test_free_matches_find_any_offset(du: float, dv: float) -> None:
-    left = render("handheld", "rgbd").stream(0)[0].load()
-    M = np.array([[1.0, 0.0, -du], [0.0, 1.0, dv]])
-    size = left.shape[::-1]
-    right = np.asarray(cv2.warpAffine(left, M, size, borderMode=cv2.BORDER_REFLECT), np.uint8)
-    matches = FreeMatcher(Config()).match(left, right)
-    assert len(matches) > 100
-    assert np.median(matches[:, 0] - matches[:, 2]) == pytest.approx(du, abs=0.05)
-    assert np.median(matches[:, 3] - matches[:, 1]) == pytest.approx(dv, abs=0.05)
