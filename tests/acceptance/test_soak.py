@@ -14,7 +14,7 @@ from gvo.types import Progress
 pytestmark = pytest.mark.acceptance
 
 SOAK = Path(__file__).parents[1] / "quality/soak.py"
-N_LAP = 12
+N_LAP = 8
 # There and back once: the ends of the thirds see the same frame.
 N_THIRD = 2 * N_LAP - 2
 # Frames after the last third: what reads ahead is at work at the end of each.
