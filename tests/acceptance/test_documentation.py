@@ -131,7 +131,14 @@ def test_a_tutorial_works_line_by_line_after_the_demo(command: Command, name: st
         assert (program, answer.code) == ("gvo", 0), f"{line}: {answer.err}"
 
 
-@pytest.mark.usefixtures("page_that_ends")
+@pytest.fixture
+def undrawn_reports(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave the reports of runs empty, but for those of the tutorials; to draw one takes long."""
+    name = "gvo.viz.report.write_run_report"
+    monkeypatch.setattr(name, lambda path, *_, **__: Path(path).touch())
+
+
+@pytest.mark.usefixtures("page_that_ends", "undrawn_reports")
 @pytest.mark.parametrize(("page", "lines"), commands())
 def test_commands_in_the_documentation_run(
     workplace: Path, command: Command, page: str, lines: list[str]
