@@ -217,11 +217,3 @@ def _pieces(points: FloatArray, n_decimals: int) -> list[list[list[float]]]:
     pieces = np.split(points, np.flatnonzero(np.isnan(points[:, 0])))
     solid = [piece[np.isfinite(piece[:, 0])] for piece in pieces]
     return [np.round(piece, n_decimals).tolist() for piece in solid if len(piece) > 0]
-
-
-def legend_of(lines: Sequence[Line]) -> list[tuple[str, str, str]]:
-    """Return name, colour and dashes of each line, as the page's legend takes them."""
-    return [
-        (line.name, line.style.color, " ".join(map(str, _DASHES[line.style.linestyle])))
-        for line in lines
-    ]

@@ -25,7 +25,6 @@ from gvo.viz.report.paths import (
     TITLES,
     Line,
     World,
-    legend_of,
     lines_of,
     loop_lines,
     path_plots,
@@ -102,16 +101,11 @@ def write_comparison_report(
                 title=f"Comparison: {names}",
                 facts=facts,
                 table={"header": header, "rows": rows},
-                **_pictures(drawn, lines, world),
+                plots=drawn,
+                scene=turning_scene(lines, world),
             )
         if plots is not None:
             write_plots(drawn, Path(plots))
-
-
-def _pictures(plots: Sequence[Plot], lines: Sequence[Line], world: World | None) -> dict[str, Any]:
-    """Return what a page needs of its plots, the turning one included."""
-    scene = None if world is None else turning_scene(lines, world)
-    return {"plots": plots, "scene": scene, "legend": legend_of(lines)}
 
 
 def truth_around(truth: Trajectory, parts: Sequence[Trajectory]) -> Trajectory:
@@ -158,7 +152,8 @@ def write_run_report(
             *edge_plots(record.edges, _first_ns(record)),
         ]
         # The page first: it must exist even if the folder cannot be written.
-        write_page(Path(path), "report.html", **_words(record), **_pictures(drawn, lines, world))
+        scene = None if world is None else turning_scene(lines, world)
+        write_page(Path(path), "report.html", **_words(record), plots=drawn, scene=scene)
         if plots is not None:
             write_plots(drawn, Path(plots))
 
