@@ -153,7 +153,7 @@ class BatchOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TaskOptions:
-    """What all tasks of a batch have in common: a token in `batch.json` tells the shared disk."""
+    """What all tasks of a batch share; by `mark` a worker sees whether `out` is the same disk."""
 
     out: Path
     mark: str

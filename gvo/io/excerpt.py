@@ -62,7 +62,7 @@ class Excerpt:
         return self == Excerpt()
 
     def n_expected(self, n_images: int, length_s: float | None = None) -> int:
-        """Estimate how many of `n_images` of stream 0 are kept; `length_s`: of the recording."""
+        """Estimate how many of `n_images` left images are kept; the recording lasts `length_s`."""
         share = 1.0
         if length_s is not None and length_s > 0:
             rest_s = max(length_s - self.start_s, 0.0)

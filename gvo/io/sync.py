@@ -100,7 +100,7 @@ def pair_images(
 
 
 class _Answers:
-    """What becomes of the images of stream 0."""
+    """Pairs and faulty frames, one for each image of stream 0, in the order of stamps."""
 
     def __init__(self, limit_ns: int, partner: str, queue_size: int) -> None:
         self._limit_ns, self._partner, self._queue_size = limit_ns, partner, queue_size

@@ -257,7 +257,7 @@ _RECONFIGURE: Final = ServiceType(
     response="dynamic_reconfigure/Config config",
 )
 _TYPES: Final = {bool: "bool", int: "int", float: "double", str: "str"}
-# Type of each kind of parameter, and the bounds to show where it has none.
+# Type of each kind of parameter, and the bounds that are shown if it has none of its own.
 _KINDS: Final[dict[str, tuple[Any, Any, Any]]] = {
     "switch": (bool, False, True),
     "choice": (str, "", ""),

@@ -30,7 +30,7 @@ _MAX_SIGMA_MS = 2.5
 # A given readout is wrong if it differs by more sigmas, and by more milliseconds, than these.
 _N_SIGMAS = 3.0
 _MIN_DIFFERENCE_MS = 2.0
-# More links than a run makes: they tell the readout, even where they add little to the poses.
+# Lower than in a run: more links measure the readout better, even if poses gain little by them.
 _LINK_GAIN = 0.5
 
 

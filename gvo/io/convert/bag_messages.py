@@ -27,7 +27,7 @@ from gvo.types import DepthArray, FloatArray, ImageArray
 _ROS2_VERSION: Final = 8
 _MAX_SECONDS_ROS1 = 2**32 - 1
 _MAX_SECONDS_ROS2 = 2**31 - 1
-# What tf2's static broadcaster offers: who comes late is given the last message all the same.
+# That of tf2's static broadcaster: late subscribers still get the last message.
 _LATCHED_QOS: Final = interfaces.Qos(
     history=interfaces.QosHistory.KEEP_LAST,
     depth=1,
@@ -39,7 +39,7 @@ _LATCHED_QOS: Final = interfaces.Qos(
     liveliness_lease_duration=interfaces.QosTime(0, 0),
     avoid_ros_namespace_conventions=False,
 )
-# The transport's header: how the depth is quantised, of which counts of 16 bits make no use.
+# The header of compressedDepth: its quantisation parameters, which 16-bit counts do not use.
 _DEPTH_HEADER = struct.pack("<iff", 0, 0.0, 0.0)
 
 

@@ -28,11 +28,11 @@ _BLOCK = 512
 class PoseGraphSource:
     """A file of g2o: `EDGE_SE3:QUAT`, `VERTEX_SE3:QUAT`, `FIX`, and the older `EDGE3`, `VERTEX3`.
 
-    A pose comes with its first edge to a known pose, together with the edges of the lines that
-    follow at once. An edge between two poses that are both unknown waits until one of them is
-    known. A file has no stamps: the n-th pose gets n seconds. The pose named by `FIX` holds the
-    world, else that of the first vertex, else that of the first edge; the poses of other vertices
-    are in no event, as the edges tell where they are.
+    A pose is yielded with its first edge to a pose yielded before, and with the edges of the lines
+    that follow directly. An edge whose poses are both new waits until one of them is yielded. The
+    file has no stamps: the n-th pose gets n seconds. The world is fixed by the pose that `FIX`
+    names, else by the first vertex, else by the first edge. Poses of other vertices are not used,
+    since the edges determine them.
 
     Parameters
     ----------

@@ -47,7 +47,7 @@ _UNKNOWN = "#999999"
 _FLOOR = 1e-3  # of the logarithmic axis
 _MARKERS = {"step": "o", "keyframe": "s", "depth": "^"}
 _HATCHES = {"step": "", "keyframe": "////", "depth": "\\\\\\\\"}
-_DECADES = (-3.0, 3.0)  # of the histogram: powers of ten
+_DECADES = (-3.0, 3.0)  # the histogram of chi-square spans 10^-3 to 10^3
 _N_BINS = 60
 
 

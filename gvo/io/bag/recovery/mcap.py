@@ -126,7 +126,7 @@ class McapScan(Scan):
         return self._read_packed(window, chunk.data, chunk.compression, losses, limit, crc)
 
     def _find_next(self, window: Window, start: int) -> int:
-        """Return the next place that the summary names, if it exists: records have no mark."""
+        """Return where to read on after damage: at the next chunk that the summary names."""
         if self._places is None:
             self._places = sorted(_places_of_summary(window))
         index = bisect_left(self._places, start)
@@ -167,7 +167,7 @@ def _parse(kind: Any, stream: ReadDataStream, *size: int) -> Any:  # noqa: ANN40
 
 
 def _places_of_summary(whole: Window) -> list[int]:
-    """Return where the chunks are, as the summary says, and where it begins itself."""
+    """Return the offsets of the chunks, as the summary lists them, and of the summary."""
     places: list[int] = []
     window = Window(whole.file, max(whole.end - _N_FOOTER, 0), whole.end)
     try:
