@@ -277,7 +277,7 @@ def test_a_report_that_cannot_be_drawn_is_told_in_the_summary_too(
     def fail(*_: object, **__: object) -> None:
         raise OSError("no space")
 
-    monkeypatch.setattr("gvo.viz.report.write_run_report", fail)
+    monkeypatch.setattr("gvo.viz.plots.plot_trajectories", fail)
     result = run_of(room, tmp_path, outputs=gvo.RunOutputs())
     assert result.report is None
     assert result.warnings == ("not all was drawn: no space",)
