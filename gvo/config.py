@@ -38,7 +38,6 @@ Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "dcs"]
 Value: TypeAlias = bool | int | float | str | None
 Kind = Literal["switch", "choice", "integer", "number"]
 _WIDEST_SLIDER = 1000.0
-_N_STEPS = 200
 # Parameters that there are no more, and the values at which they are fixed.
 _FIXED: Mapping[str, Value] = {
     "check.fault_lost_share": 0.2,
@@ -569,7 +568,7 @@ def _shown(section: str, key: str, field: Any) -> Parameter:  # noqa: ANN401
     span = math.inf if lower is None or upper is None else upper - lower
     is_number = kind in ("integer", "number")
     is_slider = is_number and span <= _WIDEST_SLIDER
-    step = _step(kind, float(start) if is_number else 0.0, span)
+    step = _step(kind, span if is_slider else 10.0 * float(start)) if is_number else 1.0
     if lower is not None and ">" in limits and (is_slider or kind == "integer"):
         lower += step
     return Parameter(
@@ -597,16 +596,8 @@ def _kind(annotation: Any) -> Kind:  # noqa: ANN401
     return kinds[plain]
 
 
-def _step(kind: Kind, start: float, span: float) -> float:
-    """Return a step of one digit, fine enough for the range, or for the start value."""
-    if kind == "integer":
+def _step(kind: Kind, size: float) -> float:
+    """Return a power of ten, about a hundredth of the range or a tenth of the value."""
+    if kind == "integer" or size <= 0.0:
         return 1.0
-    if span <= _WIDEST_SLIDER:
-        return _one_digit(span / _N_STEPS)
-    return 10.0 ** (math.floor(math.log10(start)) - 1) if start > 0 else 0.1
-
-
-def _one_digit(value: float) -> float:
-    """Return the largest of 1, 2 and 5 times a power of ten that is not above a value."""
-    power = 10.0 ** math.floor(math.log10(value) + 1e-9)
-    return float(max(factor * power for factor in (1, 2, 5) if factor * power <= value * 1.001))
+    return 10.0 ** (math.floor(math.log10(size)) - 2)
