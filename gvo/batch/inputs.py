@@ -155,21 +155,12 @@ def _numbered(named: Iterable[tuple[str, T]], taken: Container[str] = ()) -> dic
     """Return values by their names, made valid as names of folders, and unique by numbers."""
     found: dict[str, T] = {}
     for name, value in named:
-        found[free_name(safe_name(name), found, taken)] = value
+        safe = _UNSAFE.sub("_", name).lstrip(".")[:_MAX_NAME] or "_"
+        free, number = safe, 2
+        while free in found or free in taken:
+            free, number = f"{safe}-{number}", number + 1
+        found[free] = value
     return found
-
-
-def safe_name(text: str) -> str:
-    """Return a text as a valid name of a folder: `day 1/../drive` as `day_1_.._drive`."""
-    return _UNSAFE.sub("_", text).lstrip(".")[:_MAX_NAME] or "_"
-
-
-def free_name(name: str, *taken: Container[str]) -> str:
-    """Return a name, numbered if it is taken."""
-    free, number = name, 2
-    while any(free in names for names in taken):
-        free, number = f"{name}-{number}", number + 1
-    return free
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
