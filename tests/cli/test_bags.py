@@ -139,7 +139,7 @@ def test_only_the_excerpt_is_run(command: Command, walk_bag: Path, tmp_path: Pat
         (["--duration", "0"], ["--duration", "0"]),
         (["--every", "0"], ["--every", "0"]),
         (["--initial-pose", "1,2"], ["--initial-pose", "X,Y,Z"]),
-        (["--initial-pose", "0,0,0,1,1,1,1"], ["--initial-pose", "norm 2"]),
+        (["--initial-pose", "0,0,0,1,1,1,1"], ["--initial-pose", "length 2"]),
         (["--initial-pose", "truth"], ["--initial-pose truth", "no ground truth"]),
         (["--frame", "gripper"], ["--frame gripper", CAMERA]),
         (["--ground-truth", "tf:map"], ["tf:map", "two frames"]),
