@@ -1,64 +1,105 @@
-"""`gvo live -` in a process of its own, and what it reads."""
+"""Programs in processes of their own; `gvo live -`, and what it reads."""
 
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import threading
+from contextlib import suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import cv2
 import numpy as np
 
 from gvo.io.recording import RecordingInfo, Source, StampedImage
-from tests.conftest import GVO
+from tests.conftest import ENVIRONMENT, GVO
 
-LIMIT_S = 60.0
+PATIENCE_S = 90.0  # longer than that of the programs, which then say what they wait for
 
 
-class LiveCommand:
-    """The command, and what is said by it; it is ended where it says nothing for too long."""
+class Program:
+    """A process whose lines of standard output can be waited for; killed where none come."""
+
+    def __init__(self, command: list[str], environment: dict[str, str]) -> None:
+        pipes: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+        self.process = subprocess.Popen(command, env=environment, text=True, **pipes)
+        self.lines: list[str] = []
+        self.errors: list[str] = []
+        self._come = threading.Condition()
+        self._threads = [
+            threading.Thread(target=self._read, args=(self.process.stdout, self.lines)),
+            threading.Thread(target=self._read, args=(self.process.stderr, self.errors)),
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def _read(self, stream: Any, lines: list[str]) -> None:
+        with stream:
+            for line in stream:
+                with self._come:
+                    lines.append(line)
+                    self._come.notify_all()
+
+    def wait_for(self, text: str, *, n: int = 1, is_output: bool = False) -> str:
+        """Return the n-th line that holds a text, of either stream."""
+        found: list[str] = []
+
+        def has_come() -> bool:
+            lines = self.lines if is_output else (*self.lines, *self.errors)
+            found[:] = [line for line in lines if text in line]
+            return len(found) >= n
+
+        with self._come:
+            is_come = self._come.wait_for(has_come, PATIENCE_S)
+        assert is_come, (text, self.lines, self.errors)
+        return found[n - 1]
+
+    def tell(self, line: str) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(f"{line}\n")
+        self.process.stdin.flush()
+
+    def interrupt(self, number: signal.Signals = signal.SIGINT) -> int:
+        self.process.send_signal(number)
+        return self.end()
+
+    def end(self) -> int:
+        """End its standard input, and return the exit code."""
+        assert self.process.stdin is not None
+        with suppress(BrokenPipeError):
+            self.process.stdin.close()
+        code = self.process.wait(PATIENCE_S)
+        for thread in self._threads:
+            thread.join(PATIENCE_S)
+        return code
+
+
+class LiveCommand(Program):
+    """`gvo live -`, which reads images from its standard input."""
 
     def __init__(self, info: RecordingInfo, folder: Path, *options: str) -> None:
         self.out = folder / "out"
         given = [f"--calibration={path}" for path in write_calibration(info, folder)]
         fixed = ["--rectified", "--no-report", "--queue=1000", f"--out={self.out}"]
-        pipes: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
-        self.process = subprocess.Popen([*GVO, "live", "-", *given, *fixed, *options], **pipes)
-        self._timer = threading.Timer(LIMIT_S, self.process.kill)
-        self._timer.start()
+        super().__init__([*GVO, "live", "-", *given, *fixed, *options], ENVIRONMENT)
 
     def __enter__(self) -> LiveCommand:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._timer.cancel()
         self.process.kill()
-        self.process.communicate()
+        self.end()
 
     def said(self, ending: str) -> str:
-        """Return what is before the end of the next line on stderr that ends so."""
-        for line in _open(self.process.stderr):
-            before, found, _ = line.decode().rstrip().rpartition(ending)
-            if found:
-                return before.strip()
-        raise AssertionError(f"gvo live ended and did not say: {ending}")
+        """Return what is before the end of the first line that ends so."""
+        return self.wait_for(f"{ending}\n").rpartition(ending)[0].strip()
 
-    def send(self, images: bytes) -> None:
-        stdin = _open(self.process.stdin)
-        stdin.write(images)
-        stdin.flush()
-
-    def end(self) -> tuple[int, str, str]:
-        """Close its standard input; return its exit code, and what else it says."""
-        out, err = self.process.communicate()
-        return self.process.returncode, out.decode(), err.decode()
-
-
-def _open(stream: IO[bytes] | None) -> IO[bytes]:
-    assert stream is not None
-    return stream
+    def feed(self, images: bytes) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.buffer.write(images)  # type: ignore[attr-defined]
+        self.process.stdin.flush()
 
 
 def names_of(source: Source) -> tuple[str, str]:

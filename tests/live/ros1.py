@@ -2,11 +2,9 @@
 
 import json
 import shutil
-import signal
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -16,70 +14,13 @@ from xmlrpc.client import ServerProxy
 import pytest
 
 from tests.conftest import ENVIRONMENT
+from tests.live.pipe import Program
 
 DEBIAN = Path("/usr/lib/python3/dist-packages")
 PACKAGES = ("rospy", "rosmaster", "sensor_msgs", "std_srvs", "dynamic_reconfigure", "nav_msgs")
 INSTALL = "apt-get install " + " ".join(
     f"python3-{package.replace('_', '-')}" for package in (*PACKAGES, "tf2_msgs")
 )
-PATIENCE_S = 90.0  # longer than that of the programs, which then say what they wait for
-
-
-class Program:
-    """A process whose lines of standard output can be waited for; killed where none come."""
-
-    def __init__(self, command: list[str], environment: dict[str, str]) -> None:
-        pipes: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
-        self.process = subprocess.Popen(command, env=environment, text=True, **pipes)
-        self.lines: list[str] = []
-        self.errors: list[str] = []
-        self._come = threading.Condition()
-        self._threads = [
-            threading.Thread(target=self._read, args=(self.process.stdout, self.lines)),
-            threading.Thread(target=self._read, args=(self.process.stderr, self.errors)),
-        ]
-        for thread in self._threads:
-            thread.start()
-
-    def _read(self, stream: Any, lines: list[str]) -> None:
-        with stream:
-            for line in stream:
-                with self._come:
-                    lines.append(line)
-                    self._come.notify_all()
-
-    def wait_for(self, text: str, *, n: int = 1, is_output: bool = False) -> str:
-        """Return the n-th line that holds a text, of either stream."""
-        found: list[str] = []
-
-        def has_come() -> bool:
-            lines = self.lines if is_output else (*self.lines, *self.errors)
-            found[:] = [line for line in lines if text in line]
-            return len(found) >= n
-
-        with self._come:
-            is_come = self._come.wait_for(has_come, PATIENCE_S)
-        assert is_come, (text, self.lines, self.errors)
-        return found[n - 1]
-
-    def tell(self, line: str) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.write(f"{line}\n")
-        self.process.stdin.flush()
-
-    def send(self, number: signal.Signals) -> int:
-        self.process.send_signal(number)
-        return self.end()
-
-    def end(self) -> int:
-        """End its standard input, and return the exit code."""
-        assert self.process.stdin is not None
-        with suppress(BrokenPipeError):
-            self.process.stdin.close()
-        code = self.process.wait(PATIENCE_S)
-        for thread in self._threads:
-            thread.join(PATIENCE_S)
-        return code
 
 
 class Ros:

@@ -25,7 +25,7 @@ pytest.importorskip("cyclonedds")
 
 from gvo.live.dds import Dds, sockets
 from tests.conftest import GVO, Command, assert_same_files, refused, run_of
-from tests.live.ros1 import Program
+from tests.live.pipe import Program
 
 pytestmark = pytest.mark.dds
 

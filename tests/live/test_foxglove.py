@@ -343,7 +343,7 @@ def test_the_command_serves_its_run_to_foxglove(drive_bag: Path, tmp_path: Path)
                 client.next("advertise")
             client.subscribe(odometry, causal, state)
             assert client.assign(**{"klt.n_corners": 150}) == {"klt.n_corners": 150}
-            run.send(sent(source))
+            run.feed(sent(source))
             while sum(topic == odometry for topic, *_ in client.data) < N_FRAMES:
                 client.next(_DATA)
             TRIGGER.register(is_ros1=False)
@@ -351,10 +351,9 @@ def test_the_command_serves_its_run_to_foxglove(drive_bag: Path, tmp_path: Path)
             assert isinstance(saved, bytes)
             answer = decode(saved, TRIGGER.response_type, is_ros1=False)
             assert (answer.success, answer.message) == (True, f"{N_FRAMES} frames are written")
-        code, out, err = run.end()
-    assert code == 0, err
-    assert f"{N_FRAMES} frames, all tracked" in out
-    assert "foxglove" not in err.lower()
+        assert run.end() == 0, run.errors
+    assert f"{N_FRAMES} frames, all tracked" in "".join(run.lines)
+    assert "foxglove" not in "".join(run.errors).replace("serves Foxglove", "").lower()
     poses = [each for topic, _, each in decoded(client) if topic == causal]
     positions = [(p.x, p.y, p.z) for p in (each.pose.pose.position for each in poses)]
     written = gvo.read_trajectory(run.out / "causal.txt")

@@ -2,7 +2,6 @@
 
 import io
 import json
-import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -173,13 +172,11 @@ def live(*arguments: object, calibration: list[Path], out: Path) -> list[str]:
 def test_a_pipe_is_tracked_until_a_signal(drive_bag: Path, tmp_path: Path) -> None:
     source = gvo.open_recording(drive_bag)
     with LiveCommand(source.info, tmp_path) as run:
-        run.send(sent(source))
+        run.feed(sent(source))
         while n_poses(run.out) < N_FRAMES:  # the pipe stays open
             assert run.process.poll() is None
-        run.process.send_signal(signal.SIGINT)
-        code, answer, errors = run.end()
-    assert code == 0, errors
-    assert f"{N_FRAMES} frames, all tracked" in answer
+        assert run.interrupt() == 0, run.errors
+    assert f"{N_FRAMES} frames, all tracked" in "".join(run.lines)
     summary = json.loads((run.out / "summary.json").read_text())
     assert summary["state"] == "complete"
     assert (run.out / "global.txt").exists()

@@ -14,7 +14,8 @@ import gvo
 from gvo.config import list_parameters
 from gvo.types import FloatArray
 from tests.conftest import GVO, assert_same_files, python, refused, run_of
-from tests.live.ros1 import PATIENCE_S, Program, Ros
+from tests.live.pipe import PATIENCE_S, Program
+from tests.live.ros1 import Ros
 
 pytestmark = pytest.mark.ros1
 
@@ -66,7 +67,7 @@ def test_what_is_played_is_tracked_as_from_its_files(
     player = ros.start(PLAYER, gvo_data / name)
     player.wait_for("pairs sent")
     assert player.end() == 0
-    assert odometry.send(signal.SIGINT) == 0, odometry.errors
+    assert odometry.interrupt() == 0, odometry.errors
     assert_same_files(tmp_path / "out", tmp_path / "run")
     watcher.tell(str(expected.stamps_ns[-1]))
     assert watcher.end() == 0, watcher.errors
@@ -102,7 +103,7 @@ def test_a_session_goes_on_whatever_comes(ros: Ros, gvo_data: Path, tmp_path: Pa
     for index in range(40):
         driver.wait_for(f"pair {index}\n")
     check_parameters(json.loads(driver.wait_for("parameters ").partition(" ")[2]))
-    driver.send(signal.SIGKILL)
+    driver.interrupt(signal.SIGKILL)
     odometry.wait_for("no images for")
     player = ros.start(PLAYER, recording, "--ahead", "0")
     player.wait_for("pairs sent")

@@ -108,7 +108,7 @@ def test_the_page_of_a_running_camera_shows_what_comes_and_sets_parameters(
 
         def show_next() -> None:
             index = next(coming)
-            run.send(pairs[index])
+            run.feed(pairs[index])
             page.wait_for_frame(index)
 
         for _ in range(3):
@@ -127,12 +127,11 @@ def test_the_page_of_a_running_camera_shows_what_comes_and_sets_parameters(
 
         page.press("pause")
         browser.wait(lambda: page.cell("player") == "paused", message="it does not pause")
-        run.send(pairs[next(coming)])
+        run.feed(pairs[next(coming)])
         page.press("play")
         browser.wait(lambda: page.cell("player") == "playing", message="it does not play")
         show_next()
         assert browser.requests_leaving() == []
         assert browser.console_errors() == []
-        code, out, err = run.end()
-    assert code == 0, err
-    assert "6 frames, all tracked" in out
+        assert run.end() == 0, run.errors
+    assert "6 frames, all tracked" in "".join(run.lines)
