@@ -32,9 +32,9 @@ def found_in(recording: Any, readout_ms: float | None = None) -> list[Finding]:
 @pytest.mark.parametrize(
     ("readout_ms", "verdict"),
     [
-        (None, "info"),
+        pytest.param(None, "info", marks=pytest.mark.acceptance),
         (0.0, "warning"),
-        (PLANTED_MS, "ok"),
+        pytest.param(PLANTED_MS, "ok", marks=pytest.mark.acceptance),
     ],
 )
 def test_a_rolling_shutter_is_told_and_compared_with_the_readout_given(
