@@ -47,7 +47,7 @@ Every = Annotated[int, Option(metavar="N", help="Take every Nth frame.")]
 
 
 class _Group(NamedTuple):
-    """Marks a parameter of a command: the options of `make`, whose result it is given."""
+    """Marks a parameter of a command that is made by `make` from options of the command line."""
 
     make: Callable[..., Any]
 
@@ -58,7 +58,7 @@ def add_command(app: typer.Typer, name: str | None = None) -> Callable[[Callable
 
 
 def _ungrouped(run: Callable[..., None]) -> Callable[..., None]:
-    """Return a command that has the options of each group in place of its parameter."""
+    """Return a command in which each `_Group` is replaced by the options of its `make`."""
     groups: dict[str, tuple[Callable[..., Any], list[str]]] = {}
     options: list[inspect.Parameter] = []
     for name, option in inspect.signature(run, eval_str=True).parameters.items():

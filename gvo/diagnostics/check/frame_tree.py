@@ -14,7 +14,7 @@ from gvo.io.poses.truth import TRUTH_FRAMES
 from gvo.types import Failure, IntArray
 
 _N_NAMED = 5
-# Two cameras, or the ground truth of a data set, are no robot that lacks a camera.
+# A tree of fewer frames is a pair of cameras, or a data set with its ground truth: no robot.
 _MIN_FRAMES = 3
 
 

@@ -54,7 +54,7 @@ MAX_DEPTH_MEDIAN_M = 50.0
 # off at worst; 10 ms are half a pixel of a camera in the hand.
 STAMP_DIFFERENCES_MS = {"stereo": 2.0, "rgbd": 10.0}
 
-# A share of lost frames, for whatever reason, that costs accuracy, and one that costs most poses.
+# Of frames lost for one reason: from `high` on they cost accuracy, from `fault_high` most poses.
 _LOST = Rule(high=0.05, fault_high=0.2, unit="%")
 _RECTIFIED = "calibrate the pair anew, or check R and P: the topic must be as rectified as they say"
 

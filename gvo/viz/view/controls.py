@@ -20,7 +20,7 @@ DELAY_S = 0.8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Control:
-    """The handles of a parameter; `empty` is the check box for null."""
+    """What the page shows for a parameter; `empty` is the check box for null."""
 
     parameter: Parameter
     handle: Any
