@@ -10,7 +10,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from queue import Empty, SimpleQueue
-from typing import Any
+from typing import Any, TypeAlias
 
 import dask
 from distributed import CancelledError, Client, Future, KilledWorker, LocalCluster, Security
@@ -141,6 +141,9 @@ def _silenced_client() -> Iterator[None]:
         logger.setLevel(level)
 
 
+_Numbered: TypeAlias = tuple[int, Task]
+
+
 class Engine:
     """Submits tasks to a cluster and yields their rows.
 
@@ -158,28 +161,28 @@ class Engine:
         self._client, self._options, self._on_progress = client, options, on_progress
         self._id = f"gvo-batch-{uuid.uuid4().hex[:12]}"
         self._done: SimpleQueue[Future[BatchRow]] = SimpleQueue()
-        self._running: dict[Any, tuple[Task, Future[BatchRow]]] = {}
+        self._running: dict[Any, tuple[_Numbered, Future[BatchRow]]] = {}
         self._state = BatchProgress()
         self._start_s = 0.0
 
     def run(self, tasks: Sequence[Task]) -> Generator[BatchRow, None, None]:
         """Yield the row of each task as it ends; raise `ClusterError` if the scheduler is lost."""
         self._state, self._start_s = BatchProgress(n_total=len(tasks)), time.monotonic()
-        suspects: list[Task] = []
+        suspects: list[_Numbered] = []
         try:
             yield from self._run(deque(enumerate(tasks)), suspects)
-            yield from self._run(deque(enumerate(suspects, start=len(tasks))), None)
+            yield from self._run(deque(suspects), None)
         finally:
             self._client.cancel([future for _, future in self._running.values()])
 
     def _run(
-        self, waiting: deque[tuple[int, Task]], suspects: list[Task] | None
+        self, waiting: deque[_Numbered], suspects: list[_Numbered] | None
     ) -> Iterator[BatchRow]:
         while waiting or self._running:
             n_threads = self._count_workers()
             max_running = max(_MIN_IN_FLIGHT, _PER_THREAD * n_threads)
             while waiting and len(self._running) < (1 if suspects is None else max_running):
-                self._submit(*waiting.popleft())
+                self._submit(waiting.popleft(), attempt=1 if suspects is None else 0)
             row = self._next(suspects)
             if row is not None:
                 self._count(row)
@@ -187,14 +190,14 @@ class Engine:
             if self._on_progress is not None:
                 self._on_progress(replace(self._state, left_s=self._left_s(), row=row))
 
-    def _next(self, suspects: list[Task] | None) -> BatchRow | None:
+    def _next(self, suspects: list[_Numbered] | None) -> BatchRow | None:
         """Wait a moment for a task to end; return its row."""
         try:
             future = self._done.get(timeout=_TICK_S)
         except Empty:
             return None
-        task, _ = self._running.pop(future.key)
-        return self._result(task, future, suspects)
+        numbered, _ = self._running.pop(future.key)
+        return self._result(numbered, future, suspects)
 
     def _count_workers(self) -> int:
         """Count the workers; return the number of their threads."""
@@ -205,24 +208,26 @@ class Engine:
         self._state = replace(self._state, n_workers=len(threads))
         return sum(threads.values())
 
-    def _submit(self, number: int, task: Task) -> None:
+    def _submit(self, numbered: _Numbered, *, attempt: int) -> None:
         # Tasks whose keys share a prefix are one group, which the scheduler queues until a worker
         # has a free thread.
-        key = (self._id, number)
+        number, task = numbered
+        key = (self._id, number, attempt)
         future = self._client.submit(work, task, self._options, key, key=key, pure=False)
-        self._running[key] = task, future
+        self._running[key] = numbered, future
         future.add_done_callback(self._done.put)
 
     def _result(
-        self, task: Task, future: Future[BatchRow], suspects: list[Task] | None
+        self, numbered: _Numbered, future: Future[BatchRow], suspects: list[_Numbered] | None
     ) -> BatchRow | None:
+        _, task = numbered
         try:
             return future.result()
         except CancelledError as error:
             raise ClusterError(_LOST) from error
         except KilledWorker as error:
             if suspects is not None:
-                suspects.append(task)
+                suspects.append(numbered)
                 return None
             return task.row("failed", f"its worker died each time: out of memory? ({error})")
         except Exception as error:  # noqa: BLE001 - one run must not end the batch
