@@ -421,6 +421,7 @@ def velocity_errors(seed: int) -> list[list[float]]:
     return errors
 
 
+@pytest.mark.acceptance
 def test_rows_tell_the_velocity_of_the_newest_frame() -> None:
     # Of one recording it is chance: by seed the ratio is 0.7 to 1.1, over many 0.9.
     errors = {seed: velocity_errors(seed) for seed in range(1, 5)}

@@ -181,7 +181,7 @@ def programs() -> tuple[str, str]:
     try:
         import selenium  # noqa: F401
     except ModuleNotFoundError:
-        pytest.skip("no selenium: pip install 'gvo[test]'")
+        pytest.skip("no selenium: pip install 'gvo[test-all]'")
     chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
     if chromium is None or driver is None:
         pytest.skip(f"no chromium or no chromedriver: {INSTALL}")
