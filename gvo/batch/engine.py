@@ -161,7 +161,7 @@ class Engine:
         self._client, self._options, self._on_progress = client, options, on_progress
         self._id = f"gvo-batch-{uuid.uuid4().hex[:12]}"
         self._done: SimpleQueue[Future[BatchRow]] = SimpleQueue()
-        self._running: dict[Any, tuple[_Numbered, Future[BatchRow]]] = {}
+        self._running: dict[Any, tuple[Task, Future[BatchRow]]] = {}
         self._state = BatchProgress()
         self._start_s = 0.0
 
@@ -182,7 +182,7 @@ class Engine:
             n_threads = self._count_workers()
             max_running = max(_MIN_IN_FLIGHT, _PER_THREAD * n_threads)
             while waiting and len(self._running) < (1 if suspects is None else max_running):
-                self._submit(waiting.popleft(), attempt=1 if suspects is None else 0)
+                self._submit(*waiting.popleft(), attempt=1 if suspects is None else 0)
             row = self._next(suspects)
             if row is not None:
                 self._count(row)
@@ -196,8 +196,8 @@ class Engine:
             future = self._done.get(timeout=_TICK_S)
         except Empty:
             return None
-        numbered, _ = self._running.pop(future.key)
-        return self._result(numbered, future, suspects)
+        task, _ = self._running.pop(future.key)
+        return self._result(task, future, suspects)
 
     def _count_workers(self) -> int:
         """Count the workers; return the number of their threads."""
@@ -208,26 +208,24 @@ class Engine:
         self._state = replace(self._state, n_workers=len(threads))
         return sum(threads.values())
 
-    def _submit(self, numbered: _Numbered, *, attempt: int) -> None:
+    def _submit(self, number: int, task: Task, *, attempt: int) -> None:
         # Tasks whose keys share a prefix are one group, which the scheduler queues until a worker
         # has a free thread.
-        number, task = numbered
         key = (self._id, number, attempt)
         future = self._client.submit(work, task, self._options, key, key=key, pure=False)
-        self._running[key] = numbered, future
+        self._running[key] = task, future
         future.add_done_callback(self._done.put)
 
     def _result(
-        self, numbered: _Numbered, future: Future[BatchRow], suspects: list[_Numbered] | None
+        self, task: Task, future: Future[BatchRow], suspects: list[_Numbered] | None
     ) -> BatchRow | None:
-        _, task = numbered
         try:
             return future.result()
         except CancelledError as error:
             raise ClusterError(_LOST) from error
         except KilledWorker as error:
             if suspects is not None:
-                suspects.append(numbered)
+                suspects.append((future.key[1], task))
                 return None
             return task.row("failed", f"its worker died each time: out of memory? ({error})")
         except Exception as error:  # noqa: BLE001 - one run must not end the batch
