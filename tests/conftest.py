@@ -192,24 +192,36 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
     return run
 
 
+def write_drive(path: Path, *, n_frames: int, scale: float) -> Path:
+    """Write a rendered drive of a stereo camera as a bag; return its path."""
+    gvo.convert(gvo.SyntheticRecording("driving", "stereo", n_frames=n_frames, scale=scale), path)
+    return path
+
+
+def write_room(path: Path, *, n_frames: int, scale: float) -> Path:
+    """Write a walk of an RGB-D camera in a rendered room as a bag; return its path."""
+    gvo.convert(gvo.SyntheticRecording("handheld", "rgbd", n_frames=n_frames, scale=scale), path)
+    return path
+
+
+def complete_run(bag: Path, out: Path) -> Path:
+    """Run over a bag, which must succeed to the end; return the folder of the run."""
+    assert run_of(bag, out).is_complete
+    return out
+
+
 @pytest.fixture(scope="session")
 def drive_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a bag of a short rendered drive, a stereo camera at half size."""
-    from gvo.io.synthetic import SyntheticRecording
-
     path = tmp_path_factory.mktemp("bags") / "drive.mcap"
-    gvo.convert(SyntheticRecording("driving", "stereo", n_frames=20, scale=0.5), path)
-    return path
+    return write_drive(path, n_frames=20, scale=0.5)
 
 
 @pytest.fixture(scope="session")
 def room_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a bag of a short walk in a rendered room, an RGB-D camera at half size."""
-    from gvo.io.synthetic import SyntheticRecording
-
     path = tmp_path_factory.mktemp("bags") / "room.bag"
-    gvo.convert(SyntheticRecording("handheld", "rgbd", n_frames=20, scale=0.5), path)
-    return path
+    return write_room(path, n_frames=20, scale=0.5)
 
 
 @pytest.fixture(scope="session")
@@ -225,6 +237,4 @@ def walk_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def walk_run(walk_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of a run over `walk_bag`: poses of the camera from the identity."""
-    out = tmp_path_factory.mktemp("walk_run")
-    assert run_of(walk_bag, out).is_complete
-    return out
+    return complete_run(walk_bag, tmp_path_factory.mktemp("walk_run"))

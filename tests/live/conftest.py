@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-import gvo
-from tests.conftest import run_of
+from tests.conftest import complete_run, write_drive, write_room
 from tests.live.ros1 import Ros, master
 
 N_FRAMES = 12
@@ -16,34 +15,26 @@ N_FRAMES = 12
 def drive_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a bag of a drive of 12 frames, a small stereo camera."""
     path = tmp_path_factory.mktemp("bags") / "drive.mcap"
-    recording = gvo.SyntheticRecording("driving", "stereo", n_frames=N_FRAMES, scale=0.4)
-    gvo.convert(recording, path)
-    return path
+    return write_drive(path, n_frames=N_FRAMES, scale=0.4)
 
 
 @pytest.fixture(scope="session")
 def room_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a bag of ROS 1 of 12 frames in a room, a small RGB-D camera."""
     path = tmp_path_factory.mktemp("bags") / "room.bag"
-    recording = gvo.SyntheticRecording("handheld", "rgbd", n_frames=N_FRAMES, scale=0.4)
-    gvo.convert(recording, path)
-    return path
+    return write_room(path, n_frames=N_FRAMES, scale=0.4)
 
 
 @pytest.fixture(scope="session")
 def drive_run(drive_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the run over `drive_bag`."""
-    out = tmp_path_factory.mktemp("drive_run")
-    assert run_of(drive_bag, out).is_complete
-    return out
+    return complete_run(drive_bag, tmp_path_factory.mktemp("drive_run"))
 
 
 @pytest.fixture(scope="session")
 def room_run(room_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the run over `room_bag`."""
-    out = tmp_path_factory.mktemp("room_run")
-    assert run_of(room_bag, out).is_complete
-    return out
+    return complete_run(room_bag, tmp_path_factory.mktemp("room_run"))
 
 
 @pytest.fixture(scope="module")
