@@ -225,7 +225,8 @@ class Engine:
             raise ClusterError(_LOST) from error
         except KilledWorker as error:
             if suspects is not None:
-                suspects.append((future.key[1], task))
+                key: Any = future.key  # as `_submit` makes it
+                suspects.append((key[1], task))
                 return None
             return task.row("failed", f"its worker died each time: out of memory? ({error})")
         except Exception as error:  # noqa: BLE001 - one run must not end the batch
