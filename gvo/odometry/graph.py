@@ -42,9 +42,8 @@ from gvo.backend.motion_model import MAX_EXTRAPOLATION_S, predict_step
 from gvo.config import WindowConfig
 from gvo.errors import SmoothingError
 from gvo.geometry import se3
-from gvo.io.edges.events import inverted
+from gvo.geometry.edges import chi2, fuse, inverse, then
 from gvo.io.run_folder.line_file import append_whole
-from gvo.odometry.keyframes import chi2
 from gvo.types import Edge, Estimate, FloatArray, FrameId, Loop, Optimum, PosePrior, Status
 
 # Of keyframes: that of the reference and that of the frame of an edge.
@@ -365,7 +364,7 @@ class RunGraph:
             return None
         first, second = self._way_to(stamp_ns), self._way_to(loop.reference_ns)
         T = se3.invert(first.T_first_keyframe) @ second.T_first_keyframe
-        return _join(_edge(stamp_ns, T, second.covariance_since(first, drifts=True)), loop.edge)
+        return then(_edge(stamp_ns, T, second.covariance_since(first, drifts=True)), loop.edge)
 
     def allows(self, loop: Loop) -> bool:
         """Tell whether a loop leads where odometry, and what was guessed in the dark, allow it."""
@@ -455,7 +454,7 @@ class RunGraph:
         reference_ns = int(edge.reference_id)  # type: ignore[call-overload]
         if reference_ns in self._keyframes or reference_ns > self._known.stamps_ns[-1]:
             return edge
-        return self._from_keyframe(_join(self._home(reference_ns), edge))
+        return self._from_keyframe(then(self._home(reference_ns), edge))
 
     def _home(self, stamp_ns: int) -> Edge:
         """Return the pose of a frame, or of a merged keyframe, in its keyframe."""
@@ -531,7 +530,7 @@ class RunGraph:
             if stamp_ns == frame_ns:
                 _fuse(edges, int(edge.reference_id), edge)  # type: ignore[call-overload]
             else:
-                _fuse(edges, frame_ns, inverted(edge, frame_ns))
+                _fuse(edges, frame_ns, inverse(edge, frame_ns))
         del self._touching[stamp_ns]
         if loop is not None:
             _fuse(edges, int(loop.reference_id), loop)  # type: ignore[call-overload]
@@ -545,12 +544,12 @@ class RunGraph:
         self._merged.append(stamp_ns, hub_ns, stamp_ns, 0, *place)
         # What ties it to the other one counts once, shared out among the edges that go on there.
         hub = replace(hub, covariance=max(len(edges), 1) * hub.covariance)
-        moved = {ns: _join(hub, inverted(edge, stamp_ns)) for ns, edge in edges.items()}
+        moved = {ns: then(hub, inverse(edge, stamp_ns)) for ns, edge in edges.items()}
         neighbours = set().union(*(self._touching[ns] for ns in moved))
         between = [number for number in self._touching[hub_ns] if number in neighbours]
         for frame_ns, edge in self._pop_edges(between):
             if frame_ns == hub_ns:
-                _fuse(moved, int(edge.reference_id), inverted(edge, frame_ns))  # type: ignore[call-overload]
+                _fuse(moved, int(edge.reference_id), inverse(edge, frame_ns))  # type: ignore[call-overload]
             else:
                 _fuse(moved, frame_ns, edge)
         for each in moved.items():
@@ -597,7 +596,10 @@ class RunGraph:
             edges=tuple(graph._edges.values()),
             loops=loops,
             residuals=np.sqrt(
-                [chi2(each.edge, poses[each.reference_ns], poses[each.stamp_ns]) for each in loops]
+                [
+                    chi2(each.edge, se3.invert(poses[each.reference_ns]) @ poses[each.stamp_ns])
+                    for each in loops
+                ]
             ),
             error_before=error_before,
             error=optimizer.error,
@@ -899,32 +901,13 @@ def _edge(reference_id: FrameId, T: FloatArray, covariance: FloatArray) -> Edge:
     return Edge(reference_id=reference_id, T_reference_frame=T, covariance=covariance)
 
 
-def _join(first: Edge, second: Edge) -> Edge:
-    """Return an edge and the one that goes on from its end as one."""
-    T = second.T_reference_frame
-    return replace(
-        second,
-        reference_id=first.reference_id,
-        T_reference_frame=first.T_reference_frame @ T,
-        covariance=se3.compose_covariance(first.covariance, T, second.covariance),
-    )
-
-
 def _ends(loop: Loop) -> tuple[object, int]:
     return loop.reference_ns, loop.stamp_ns
 
 
 def _fuse(edges: dict[int, Edge], key: int, edge: Edge) -> None:
     """Add an edge, made one with what is there already, from the same frame to the same."""
-    if key not in edges:
-        edges[key] = edge
-        return
-    T, covariance = edges[key].T_reference_frame, edges[key].covariance
-    gain = covariance @ np.linalg.inv(covariance + edge.covariance)
-    T = T @ se3.exp(gain @ se3.log(se3.invert(T) @ edge.T_reference_frame))
-    covariance = gain @ edge.covariance
-    covariance = 0.5 * (covariance + covariance.T)
-    edges[key] = replace(edge, T_reference_frame=se3.normalize(T), covariance=covariance)
+    edges[key] = fuse([edges[key], edge]) if key in edges else edge
 
 
 def _drift(edge: Edge, share: float) -> FloatArray:

@@ -17,6 +17,7 @@ from gvo.config import WindowConfig
 from gvo.frontend.protocol import HasPoints, ObservationsT
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
+from gvo.geometry.edges import chi2
 from gvo.odometry.chain import RawStep
 from gvo.types import Edge, Estimate, FloatArray, FrameLink, LinkKind
 
@@ -296,20 +297,13 @@ def judge_links(
         FrameLink(
             reference_ns=int(edge.reference_id),  # type: ignore[call-overload]
             kind=kind,
-            chi2=chi2(edge, window.pose(edge.reference_id), window.pose(frame_id))
+            chi2=chi2(edge, se3.invert(window.pose(edge.reference_id)) @ window.pose(frame_id))
             if is_there and edge.reference_id in window
             else None,
             is_accepted=id(edge) in accepted,
         )
         for kind, edge in offered
     )
-
-
-def chi2(edge: Edge, T_world_reference: FloatArray, T_world_frame: FloatArray) -> float:
-    """Return the squared norm of the whitened residual of an edge between two poses (4, 4)."""
-    T_reference_frame = se3.invert(T_world_reference) @ T_world_frame
-    residual = se3.log(se3.invert(edge.T_reference_frame) @ T_reference_frame)
-    return float(se3.mahalanobis(residual, edge.covariance))
 
 
 def misclosure(link: Edge, start: Estimate, end: Estimate) -> float:

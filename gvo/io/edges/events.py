@@ -8,7 +8,6 @@ from typing import Protocol, TypeAlias
 
 import numpy as np
 
-from gvo.geometry import se3
 from gvo.types import Edge, FloatArray, FrameId, PosePrior, Prior
 
 ANCHOR_SIGMA = 1e-5
@@ -109,29 +108,3 @@ class EdgeSource(Protocol):
 def anchor(T_world_frame: FloatArray) -> PosePrior:
     """Return the prior of a pose that holds the world, from T_world_frame, shape (4, 4)."""
     return PosePrior(T_world_frame=T_world_frame, covariance=ANCHOR_SIGMA**2 * np.eye(6))
-
-
-def inverted(edge: Edge, frame_id: FrameId) -> Edge:
-    """Return an edge seen from its other end.
-
-    Parameters
-    ----------
-    edge : Edge
-        Measures `frame_id` in its reference.
-    frame_id : hashable
-        The reference of the result.
-
-    Returns
-    -------
-    Edge
-        The same measurement of the former reference; its residuals have the same chi-square.
-    """
-    T = edge.T_reference_frame
-    # (T exp(d))^-1 = T^-1 exp(-Ad_T d)
-    covariance = se3.transport_covariance(edge.covariance, T)
-    return Edge(
-        reference_id=frame_id,
-        T_reference_frame=se3.invert(T),
-        covariance=0.5 * (covariance + covariance.T),
-        kernel=edge.kernel,
-    )

@@ -13,7 +13,8 @@ import numpy as np
 
 from gvo._text import text_lines
 from gvo.errors import OutputError, TrajectoryError, write_faults
-from gvo.io.edges.events import EdgeEvent, Event, InputFaults, PoseEvent, anchor, inverted
+from gvo.geometry.edges import inverse
+from gvo.io.edges.events import EdgeEvent, Event, InputFaults, PoseEvent, anchor
 from gvo.io.run_folder.line_file import replace_text
 from gvo.trajectory import g2o
 from gvo.types import Edge, FloatArray, FrameId
@@ -222,7 +223,7 @@ class _Connector:
             frame_id=frame_id,
             stamp_ns=next(self._stamps_ns),
             edges=tuple(
-                _edge(line) if line.frame_id == frame_id else inverted(_edge(line), line.frame_id)
+                _edge(line) if line.frame_id == frame_id else inverse(_edge(line), line.frame_id)
                 for line in lines
             ),
             prior=None if fixed is None else anchor(fixed),
