@@ -32,7 +32,8 @@ def hat(xi: FloatArray) -> FloatArray:
 
 def samples(edge: Edge, rng: np.random.Generator, n: int) -> FloatArray:
     errors = rng.multivariate_normal(np.zeros(6), edge.covariance, size=n)
-    return edge.T_reference_frame @ np.stack([expm(hat(error)) for error in errors])
+    moved = np.array([expm(hat(error)) for error in errors], dtype=np.float64)
+    return np.asarray(edge.T_reference_frame @ moved, dtype=np.float64)
 
 
 def spread(T: FloatArray, about: FloatArray) -> FloatArray:
@@ -72,7 +73,10 @@ def test_covariances_are_those_of_samples() -> None:
     first, second = edge_of(1, sigma=2e-3), edge_of(2, "b", sigma=2e-3)
     pairs = samples(first, rng, 2000), samples(second, rng, 2000)
     joined, turned = then(first, second), inverse(first, "b")
-    for edge, sampled in ((joined, pairs[0] @ pairs[1]), (turned, np.linalg.inv(pairs[0]))):
+    for edge, sampled in (
+        (joined, pairs[0] @ pairs[1]),
+        (turned, np.asarray(np.linalg.inv(pairs[0]), dtype=np.float64)),
+    ):
         expected = spread(sampled, edge.T_reference_frame)
         scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
         assert np.abs((edge.covariance - expected) / scale).max() < 0.1
