@@ -33,7 +33,8 @@ def hat(xi: FloatArray) -> FloatArray:
 def samples(edge: Edge, rng: np.random.Generator, n: int) -> FloatArray:
     errors = rng.multivariate_normal(np.zeros(6), edge.covariance, size=n)
     moved = np.array([expm(hat(error)) for error in errors], dtype=np.float64)
-    return np.asarray(edge.T_reference_frame @ moved, dtype=np.float64)
+    poses: FloatArray = edge.T_reference_frame @ moved
+    return poses
 
 
 def spread(T: FloatArray, about: FloatArray) -> FloatArray:
