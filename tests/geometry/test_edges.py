@@ -40,7 +40,7 @@ def samples(edge: Edge, rng: np.random.Generator, n: int) -> FloatArray:
 def spread(T: FloatArray, about: FloatArray) -> FloatArray:
     logs = [np.real(logm(np.linalg.inv(about) @ each)) for each in T]
     errors = np.array([[m[2, 1], m[0, 2], m[1, 0], *m[:3, 3]] for m in logs])
-    return errors.T @ errors / len(errors)
+    return np.asarray(errors.T @ errors / len(errors))
 
 
 @given(SEEDS)
