@@ -199,6 +199,7 @@ class Mutation:
     survivors: list[Mutant] = field(default_factory=list)
     n_run: int = 0
     failed: bool = False
+    failing_test: str | None = None  # without a mutant
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         self.failed |= report.failed
@@ -210,10 +211,9 @@ class Mutation:
             if pid == 0:
                 _hush()
                 self._measure(session, answer)
-                os._exit(int(self.failed))
             if os.waitpid(pid, 0)[1]:
-                failing = answer.read_text() if answer.exists() else "all of them"
-                raise SystemExit(f"mutation: without a mutant this fails: {failing}")
+                self.failing_test = answer.read_text()
+                return True
             seconds, reached = json.loads(answer.read_text())
         gc.freeze()  # so that forks share what is there
         running: dict[int, Mutant] = {}
@@ -229,24 +229,31 @@ class Mutation:
         return True
 
     def _measure(self, session: pytest.Session, answer: Path) -> None:
-        """Run all tests once; write down how long each takes and which lines it reaches."""
+        """Run all tests once; write down how long each takes and which lines it reaches.
+
+        The process ends, with 1 where a test failed; then its name is written down.
+        """
         files = sorted({str(mutant.path) for mutant in self.mutants})
         tracer = coverage.Coverage(data_file=None, config_file=False, include=files)
         tracer.start()
         seconds = []
         indices = range(len(session.items))
         for index, following in zip_longest(indices, indices[1:]):
+            answer.write_text(session.items[index].nodeid)
             tracer.switch_context(str(index))
             start = time.process_time()
-            _run_test(session, index, following)
+            try:
+                _run_test(session, index, following)
+            except BaseException:  # noqa: BLE001 - as pytest.exit or an interrupt
+                self.failed = True
             seconds.append(time.process_time() - start)
             if self.failed:
-                answer.write_text(session.items[index].nodeid)
-                return
+                os._exit(1)
         tracer.stop()
         data = tracer.get_data()
         reached = {file: data.contexts_by_lineno(file) for file in data.measured_files()}
         answer.write_text(json.dumps([seconds, reached]))
+        os._exit(0)
 
     def _fork(
         self, mutant: Mutant, session: pytest.Session, tests: list[int], seconds: list[float]
@@ -335,7 +342,11 @@ def main() -> int:
     with Path(os.devnull).open("w") as nothing, redirect_stdout(nothing):
         code = pytest.main([*options, *tests], plugins=[mutation])
     if mutation.n_run == 0:
-        raise SystemExit(f"mutation: no mutant could be run (pytest ended with {code})")
+        reason = f"without a mutant this test fails: {mutation.failing_test}"
+        if mutation.failing_test is None:
+            reason = f"no mutant could be run (pytest ended with {int(code)})"
+        print(f"mutation: {reason}", file=sys.stderr)
+        return 2
     n_killed = mutation.n_run - len(mutation.survivors)
     low, high = binomtest(n_killed, mutation.n_run).proportion_ci(method="wilson")
     print(
