@@ -190,7 +190,7 @@ def _statements(node: ast.stmt) -> Iterator[tuple[str, ast.AST]]:
         yield "statement", ast.Return(value=ast.Constant(value=None))
 
 
-@dataclass(kw_only=True)
+@dataclass(kw_only=True, eq=False)
 class Mutation:
     """A pytest plugin that runs mutants in place of the tests."""
 
@@ -199,10 +199,12 @@ class Mutation:
     survivors: list[Mutant] = field(default_factory=list)
     n_run: int = 0
     failed: bool = False
-    failing_test: str | None = None  # without a mutant
+    reason: str = ""
+    failing_test: str | None = None  # without a mutant, and why
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        self.failed |= report.failed
+        if report.failed:
+            self.failed, self.reason = True, report.longreprtext.rpartition("\n")[2]
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         with tempfile.TemporaryDirectory() as folder:
@@ -212,7 +214,7 @@ class Mutation:
                 _hush()
                 self._measure(session, answer)
             if os.waitpid(pid, 0)[1]:
-                self.failing_test = answer.read_text()
+                self.failing_test = answer.read_text() if answer.exists() else "a fork of pytest"
                 return True
             seconds, reached = json.loads(answer.read_text())
         gc.freeze()  # so that forks share what is there
@@ -231,7 +233,7 @@ class Mutation:
     def _measure(self, session: pytest.Session, answer: Path) -> None:
         """Run all tests once; write down how long each takes and which lines it reaches.
 
-        The process ends, with 1 where a test failed; then its name is written down.
+        The process ends, with 1 where a test failed; then its name and reason are written down.
         """
         files = sorted({str(mutant.path) for mutant in self.mutants})
         tracer = coverage.Coverage(data_file=None, config_file=False, include=files)
@@ -239,15 +241,15 @@ class Mutation:
         seconds = []
         indices = range(len(session.items))
         for index, following in zip_longest(indices, indices[1:]):
-            answer.write_text(session.items[index].nodeid)
             tracer.switch_context(str(index))
             start = time.process_time()
             try:
                 _run_test(session, index, following)
-            except BaseException:  # noqa: BLE001 - as pytest.exit or an interrupt
-                self.failed = True
+            except BaseException as error:  # noqa: BLE001 - as pytest.exit or an interrupt
+                self.failed, self.reason = True, repr(error)
             seconds.append(time.process_time() - start)
             if self.failed:
+                answer.write_text(f"{session.items[index].nodeid}: {self.reason}")
                 os._exit(1)
         tracer.stop()
         data = tracer.get_data()
