@@ -80,6 +80,8 @@ _FIXED: Mapping[str, Value] = {
     "klt.pixel_sigma_px": 0.15,
     "klt.sigma_factor": 2.4,
     "klt.window_radius_px": 4,
+    "registration.gate": 3.0,
+    "registration.huber": 1.5,
     "registration.n_iterations": 10,
     "registration.pixel_sigma_px": 0.7,
     "registration.sigma_factor": 1.2,
@@ -254,12 +256,6 @@ class RegistrationConfig(Section):
     )
     refine: Literal["gauss_newton", "none"] = _expert(
         "gauss_newton", "refinement of the pose on (u, v, disparity) residuals after RANSAC"
-    )
-    huber: float = _expert(
-        1.5, "threshold of the Huber kernel on the whitened residual of a match", "sigma", gt=0
-    )
-    gate: float = _expert(
-        3.0, "maximum whitened residual of an inlier of the refined pose", "sigma", gt=0
     )
 
 

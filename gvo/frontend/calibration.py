@@ -632,7 +632,7 @@ class CalibratedCamera:
         self._offered.clear()
         if is_step:
             self._offsets.note_disparity(result.calibration_errors.get(DISPARITY))
-            self._learn_readout(measured.frames[0], config)
+            self._learn_readout(measured.frames[0])
         if READOUT in self._offsets.learnt:
             self._accepted.append((measured, result))
 
@@ -710,8 +710,7 @@ class CalibratedCamera:
         inliers = find_inliers(T[np.newaxis], prepared, self._camera, config.ransac)[0]
         if np.count_nonzero(inliers) < config.ransac.min_inliers:
             return None
-        huber = config.registration.huber
-        residuals = StereoResiduals.of(T, prepared, self._camera, huber=huber).select(inliers)
+        residuals = StereoResiduals.of(T, prepared, self._camera).select(inliers)
         factor = measured.sigma_factor
         found = adjust(T, residuals, n_iterations=_N_ITERATIONS, sigma_factor=factor)
         if found is None:
@@ -751,7 +750,7 @@ class CalibratedCamera:
             sensitivities |= self._by_velocity(corrected, sigmas, readout_s)
         return replace(corrected, sensitivities=sensitivities)
 
-    def _learn_readout(self, frame: Stamped, config: Config) -> None:
+    def _learn_readout(self, frame: Stamped) -> None:
         """Take what a frame tells of the readout, now that the step after it is known, too.
 
         Keyframes tell it best, seen by a camera that moved another way; its step counts without
@@ -763,9 +762,8 @@ class CalibratedCamera:
         links = told_by[1:]
         for measured, result in links or (told_by if self._offsets.possible_readout_s else ()):
             T = se3.invert(result.T_reference_current)
-            residuals = StereoResiduals.of(
-                T, self.prepare(measured, None), self._camera, huber=config.registration.huber
-            ).select(result.inliers)
+            prepared = self.prepare(measured, None)
+            residuals = StereoResiduals.of(T, prepared, self._camera).select(result.inliers)
             at = residuals.linearize(T)
             told = {} if isinstance(at, Failure) else estimate_constants(T, residuals, at)
             if READOUT in told:

@@ -126,8 +126,8 @@ def estimate_roughly(
     found = find_consensus(correspondences, camera, config, stamps_ns, T)
     if isinstance(found, Failure):
         return found
-    T, huber = found.T_target_source, config.registration.huber
-    residuals = StereoResiduals.of(T, correspondences, camera, huber=huber)
+    T = found.T_target_source
+    residuals = StereoResiduals.of(T, correspondences, camera)
     refined = descend(T, residuals.select(found.inliers), n_iterations=_N_ROUGH_ITERATIONS)
     return T if refined is None else refined
 
@@ -163,10 +163,8 @@ def _known_consensus(
 def _refine(
     consensus: Consensus, correspondences: Correspondences, camera: StereoCamera, config: Config
 ) -> Refinement | Failure:
-    registration = config.registration
-    return (fit_covariance if registration.refine == "none" else refine_pose)(
-        consensus.T_target_source, correspondences, consensus.inliers, camera, registration
-    )
+    refine = fit_covariance if config.registration.refine == "none" else refine_pose
+    return refine(consensus.T_target_source, correspondences, consensus.inliers, camera)
 
 
 def _conclude(

@@ -25,12 +25,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gvo.config import Config, RegistrationConfig
+from gvo.config import Config
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.ransac import ransac_rigid
-from gvo.geometry.refinement import Refinement, descend, refine_pose
+from gvo.geometry.refinement import GATE, Refinement, descend, refine_pose
 from gvo.types import BoolArray, Contradiction, Failure, FloatArray, MotionPrior
 
 # Smallest share of the matches that makes a second motion: below, it is a car in the distance, or
@@ -71,10 +71,9 @@ class _Problem:
         return max(self.config.ransac.min_inliers, _SIZEABLE * len(self.matches))
 
     def refine(
-        self, T: FloatArray, inliers: BoolArray, config: RegistrationConfig | None = None
+        self, T: FloatArray, inliers: BoolArray, *, gate: float = GATE
     ) -> Refinement | Failure:
-        config = config or self.config.registration
-        return refine_pose(T, self.matches, inliers, self.camera, config)
+        return refine_pose(T, self.matches, inliers, self.camera, gate=gate)
 
     def distance_px(self, T_first: FloatArray, T_second: FloatArray) -> float:
         """Return the median distance of the points as two motions project them."""
@@ -136,7 +135,7 @@ def _prefer_predicted_motion(
     if second is None or isinstance(second, Failure):
         return first
     # Without the others' matches the first motion is no compromise any more.
-    is_second = first.residuals.within(second.T_target_source, problem.config.registration.gate)
+    is_second = first.residuals.within(second.T_target_source, GATE)
     rest = first.inliers & ~is_second
     if np.count_nonzero(rest) >= problem.n_needed:
         alone = problem.refine(first.T_target_source, rest)
@@ -156,9 +155,9 @@ def _find_other(
     make_rng: Callable[[], np.random.Generator],
 ) -> tuple[FloatArray, BoolArray] | None:
     """Return a second motion, roughly, and the matches that fit it alone; None where few do."""
-    residuals, gate, n_needed = first.residuals, problem.config.registration.gate, problem.n_needed
+    residuals, n_needed = first.residuals, problem.n_needed
     squared = residuals.squared(first.T_target_source)
-    misfits = squared >= gate**2
+    misfits = squared >= GATE**2
     if np.count_nonzero(misfits) < n_needed:
         return None
     if T_predicted is None:
@@ -168,7 +167,7 @@ def _find_other(
         T_other = _descend(first, T_predicted, seeds, n_needed)
     if T_other is None:
         return None
-    supporters = misfits & residuals.within(T_other, gate)
+    supporters = misfits & residuals.within(T_other, GATE)
     return (T_other, supporters) if np.count_nonzero(supporters) >= n_needed else None
 
 
@@ -206,7 +205,7 @@ def _group(refined: Refinement, problem: _Problem, T_predicted: FloatArray | Non
     T = refined.T_target_source
     return _Group(
         refined=refined,
-        fitting=refined.residuals.within(T, problem.config.registration.gate),
+        fitting=refined.residuals.within(T, GATE),
         surprise_px=np.inf if T_predicted is None else problem.distance_px(T, T_predicted),
     )
 
@@ -255,7 +254,7 @@ def _prefer_recent_motion(found: Refinement, problem: _Problem, T_recent: FloatA
     scale = np.sqrt(np.median(np.minimum(squared, recently)) / _MEDIAN_SQUARED)
     if scale > _MAX_SCALE:
         return found
-    gate = problem.config.registration.gate * max(float(scale), _MIN_SCALE)
+    gate = GATE * max(float(scale), _MIN_SCALE)
     misfits = squared >= gate**2
     T_other = _descend(found, T_recent, seeds & misfits, problem.n_needed)
     if T_other is None:
@@ -264,8 +263,7 @@ def _prefer_recent_motion(found: Refinement, problem: _Problem, T_recent: FloatA
     is_enough = np.count_nonzero(supporters) >= problem.n_needed
     if not (is_enough and _is_continued(T_other, found.T_target_source, T_recent, problem)):
         return found
-    registration = problem.config.registration.model_copy(update={"gate": gate})
-    second = problem.refine(T_other, supporters, registration)
+    second = problem.refine(T_other, supporters, gate=gate)
     return found if isinstance(second, Failure) else second
 
 

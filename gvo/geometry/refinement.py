@@ -28,12 +28,20 @@ import cv2
 import numpy as np
 from scipy.linalg.lapack import dposv
 
-from gvo.config import RegistrationConfig
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
-from gvo.geometry.residuals import Linearization, StereoResiduals, pose_jacobian, whiten_in_place
+from gvo.geometry.residuals import (
+    HUBER,
+    Linearization,
+    StereoResiduals,
+    pose_jacobian,
+    whiten_in_place,
+)
 from gvo.types import BoolArray, ConstantError, Failure, FloatArray
+
+GATE = 3.0
+"""Maximum whitened residual of an inlier of a refined pose, sigmas."""
 
 # Iterations at most after the inliers are chosen again.
 _N_ITERATIONS = 10
@@ -95,7 +103,9 @@ def refine_pose(
     matches: Correspondences,
     inliers: BoolArray,
     camera: StereoCamera,
-    config: RegistrationConfig,
+    *,
+    huber: float = HUBER,
+    gate: float = GATE,
 ) -> Refinement | Failure:
     """Minimize the Huber cost of whitened (u, v, disparity) residuals.
 
@@ -112,15 +122,17 @@ def refine_pose(
         Initial inliers.
     camera : StereoCamera
         Of both frames.
-    config : RegistrationConfig
-        Kernel threshold, gate.
+    huber : float
+        Threshold of the Huber kernel on the whitened residual of a match, sigmas.
+    gate : float
+        Maximum whitened residual of an inlier of the refined pose, sigmas.
 
     Returns
     -------
     Refinement or Failure
         A failure if a direction of motion is unobservable.
     """
-    residuals = StereoResiduals.of(T_target_source, matches, camera, huber=config.huber)
+    residuals = StereoResiduals.of(T_target_source, matches, camera, huber=huber)
     # Unobservable directions may give steps that are not finite; they are checked.
     with np.errstate(over="ignore", invalid="ignore"):
         rough = _gauss_newton(
@@ -128,7 +140,7 @@ def refine_pose(
         )
         if isinstance(rough, Failure):
             return rough
-        chosen = residuals.within(rough, config.gate)
+        chosen = residuals.within(rough, gate)
         if np.count_nonzero(chosen) < np.count_nonzero(inliers) // 2:
             chosen = inliers
         every, residuals = residuals, residuals.select(chosen)
@@ -234,13 +246,14 @@ def fit_covariance(
     matches: Correspondences,
     inliers: BoolArray,
     camera: StereoCamera,
-    config: RegistrationConfig,
+    *,
+    huber: float = HUBER,
 ) -> Refinement | Failure:
     """Return an unrefined pose with the covariance implied by its residuals.
 
     Parameters and results are those of `refine_pose`; pose and inliers stay as they are.
     """
-    residuals = StereoResiduals.of(T_target_source, matches, camera, huber=config.huber)
+    residuals = StereoResiduals.of(T_target_source, matches, camera, huber=huber)
     return _with_covariance(T_target_source, residuals.select(inliers), (inliers, residuals))
 
 

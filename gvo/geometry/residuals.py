@@ -17,6 +17,9 @@ from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.types import BoolArray, Failure, FloatArray
 
+HUBER = 1.5
+"""Threshold of the robust kernel on the whitened residual of a match, sigmas."""
+
 _MIN_DEPTH_M = 1e-3
 _N_ROWS = 15
 # Nearer points, and points behind the camera, are no inliers: their noise is not propagated.
@@ -148,7 +151,7 @@ class StereoResiduals:
 
     @classmethod
     def of(
-        cls, T: FloatArray, matches: Correspondences, camera: StereoCamera, *, huber: float
+        cls, T: FloatArray, matches: Correspondences, camera: StereoCamera, *, huber: float = HUBER
     ) -> StereoResiduals:
         """Whiten by the noise of both frames, propagated through the start value T.
 

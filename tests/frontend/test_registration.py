@@ -31,7 +31,7 @@ def configure(
     return Config.model_validate(
         {
             "ransac": {"n_hypotheses": 150, "min_inliers": 12, "min_disparity_px": 3.0} | ransac,
-            "registration": {"refine": refine, "weighting": weighting, "huber": 2.8, "gate": 4.0},
+            "registration": {"refine": refine, "weighting": weighting},
         }
     )
 
@@ -108,7 +108,8 @@ def test_the_covariance_perturbs_the_pose_on_the_right() -> None:
         assert isinstance(result, RelativePose)
         error = se3.log(np.linalg.inv(T) @ result.T_reference_current)
         whitened.append(error @ np.linalg.solve(result.covariance, error))
-    assert 0.7 < np.mean(whitened) / 6 < 1.4
+    # Twice as much on the other side. The gate leaves the largest residuals out: above 1.
+    assert 0.7 < np.mean(whitened) / 6 < 2.0
 
 
 @pytest.mark.parametrize("weighting", ["inverse_depth", "none"])

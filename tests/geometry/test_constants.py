@@ -7,7 +7,6 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from gvo.config import RegistrationConfig
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.refinement import Refinement, estimate_constants, refine_pose
@@ -24,7 +23,7 @@ from tests.geometry.scenes import (
 )
 
 CAMERA = StereoCamera(fx=700.0, fy=690.0, cx=600.0, cy=180.0, width=1226, height=370, baseline=0.5)
-SETTINGS = RegistrationConfig(huber=2.8, gate=5.0)
+SETTINGS = {"huber": 2.8, "gate": 5.0}
 SIGMA = 0.2
 
 
@@ -65,7 +64,7 @@ def linearized(T: FloatArray, matches: Correspondences) -> tuple[StereoResiduals
 
 
 def refine(T: FloatArray, matches: Correspondences) -> Refinement:
-    result = refine_pose(T, matches, all_of(matches), CAMERA, SETTINGS)
+    result = refine_pose(T, matches, all_of(matches), CAMERA, **SETTINGS)
     assert isinstance(result, Refinement), result
     return result
 

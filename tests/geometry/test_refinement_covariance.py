@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from gvo.config import RegistrationConfig
 from gvo.geometry import se3
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.refinement import Refinement, adjust, descend, fit_covariance, refine_pose
@@ -29,7 +28,7 @@ from tests.geometry.scenes import (
 )
 
 HUBER = 1.9
-SETTINGS = RegistrationConfig(huber=HUBER, gate=4.0)
+SETTINGS = {"huber": HUBER, "gate": 4.0}
 
 
 def measure(rng: np.random.Generator, errors: FloatArray) -> tuple[FloatArray, Correspondences]:
@@ -83,7 +82,7 @@ def add_up(T: FloatArray, matches: Correspondences) -> Sums:
 
 
 def covariance_of(T: FloatArray, matches: Correspondences) -> Refinement:
-    found = fit_covariance(T, matches, all_of(matches), CAMERA, SETTINGS)
+    found = fit_covariance(T, matches, all_of(matches), CAMERA, huber=HUBER)
     assert isinstance(found, Refinement), found
     return found
 
@@ -161,7 +160,7 @@ def test_a_direction_is_open_beyond_100000_sigmas(inflation: float, is_open: boo
     spread = 1e-4 * np.sqrt(inflation_of(seen_near_a_line(1e-4)) / inflation)
     matches = seen_near_a_line(float(spread))
     assert inflation_of(matches) == pytest.approx(inflation, rel=0.05)
-    found = fit_covariance(np.eye(4), matches, all_of(matches), CAMERA, SETTINGS)
+    found = fit_covariance(np.eye(4), matches, all_of(matches), CAMERA, huber=HUBER)
     assert isinstance(found, Failure if is_open else Refinement)
 
 
@@ -172,11 +171,10 @@ def test_the_first_round_has_two_steps_and_the_second_ten() -> None:
     rng = np.random.default_rng(0)
     T, matches = measure(rng, rng.normal(size=(40, 3)))
     # So far away, and so narrow a kernel, that no step is small.
-    config = RegistrationConfig(huber=0.01, gate=1e6)
     start = se3.exp(np.full(6, 0.05)) @ T
-    found = refine_pose(start, matches, all_of(matches), CAMERA, config)
+    found = refine_pose(start, matches, all_of(matches), CAMERA, huber=0.01, gate=1e6)
     assert isinstance(found, Refinement)
-    residuals = StereoResiduals.of(start, matches, CAMERA, huber=config.huber)
+    residuals = StereoResiduals.of(start, matches, CAMERA, huber=0.01)
     ends = []
     for n_first, n_second in ((2, 10), (2, 9), (1, 10)):
         rough = descend(start, residuals, n_iterations=n_first)
@@ -212,7 +210,7 @@ def test_a_choice_that_loses_half_of_the_inliers_is_not_taken(n_wrong: int, n_ke
     sigmas[:10] = 1e-3
     uvd = project(matches.target_points) + sigmas * errors
     matches = replace(matches, target_uvd=uvd, target_sigmas=sigmas)
-    found = refine_pose(T, matches, all_of(matches), CAMERA, SETTINGS)
+    found = refine_pose(T, matches, all_of(matches), CAMERA, **SETTINGS)
     assert isinstance(found, Refinement)
     assert np.count_nonzero(found.inliers) == n_kept
     assert found.inliers[:10].all()
@@ -223,7 +221,7 @@ def test_a_refined_pose_is_a_rotation_to_the_last_digit() -> None:
     T, matches = measure(rng, rng.normal(size=(40, 3)))
     spoilt = T.copy()
     spoilt[:3, :3] *= 1.0 + 1e-6
-    found = refine_pose(spoilt, matches, all_of(matches), CAMERA, SETTINGS)
+    found = refine_pose(spoilt, matches, all_of(matches), CAMERA, **SETTINGS)
     assert isinstance(found, Refinement)
     R = found.T_target_source[:3, :3]
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-14)
@@ -242,8 +240,7 @@ def test_descending_leads_where_a_refinement_leads() -> None:
     start = se3.exp(0.02 * rng.normal(size=6)) @ T
     residuals = residuals_of(start, matches)
     found = descend(start, residuals, n_iterations=20)
-    wide = RegistrationConfig(huber=HUBER, gate=1e6)
-    refined = refine_pose(start, matches, all_of(matches), CAMERA, wide)
+    refined = refine_pose(start, matches, all_of(matches), CAMERA, huber=HUBER, gate=1e6)
     assert found is not None
     assert isinstance(refined, Refinement)
     np.testing.assert_allclose(found, refined.T_target_source, atol=1e-4)
@@ -271,7 +268,7 @@ def test_numbers_that_overflow_on_the_way_are_no_warning(is_refined: bool) -> No
     _, matches = measure(np.random.default_rng(7), np.full((12, 3), 1e160))
     residuals = residuals_of(np.eye(4), matches)
     if is_refined:
-        answer = refine_pose(np.eye(4), matches, all_of(matches), CAMERA, SETTINGS)
+        answer = refine_pose(np.eye(4), matches, all_of(matches), CAMERA, **SETTINGS)
         assert isinstance(answer, Failure)
     else:
         assert descend(np.eye(4), residuals, n_iterations=3) is None

@@ -179,7 +179,7 @@ def _find_motion(
         return motion | {"inliers": consensus.inliers}
     ends = consensus.T_target_source, se3.invert(result.T_reference_current)
     residuals_px = np.stack([_residuals(T, matches, camera) for T in ends])
-    known = StereoResiduals.of(ends[0], matches, camera, huber=config.registration.huber)
+    known = StereoResiduals.of(ends[0], matches, camera)
     whitened = residuals_px.transpose(0, 2, 1).copy()
     for rows in whitened:
         whiten_in_place(known.columns[6:12], rows)
