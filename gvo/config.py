@@ -92,6 +92,8 @@ _FIXED: Mapping[str, Value] = {
     "sync.age_penalty": 0.1,
     "sync.queue_size": 100,
     "window.kernel_threshold": None,
+    "window.keyframe_overlap": 0.9,
+    "window.min_overlap": 0.4,
     "window.zero_motion": False,
     "window.zero_motion_flow_px": 1.0,
     "window.zero_motion_gate": 5.0,
@@ -269,16 +271,10 @@ class WindowConfig(Section):
     n_links: int = _expert(
         3, "maximum registrations per frame, with its predecessor and keyframes", ge=1, le=20
     )
-    min_overlap: float = _expert(
-        0.4, "minimum share of a keyframe's points in view to link it", ge=0, le=1
-    )
     link_gain: float = _expert(
         2.0,
         "minimum number of steps since a keyframe was asked, times its share in view, to link it",
         gt=0,
-    )
-    keyframe_overlap: float = _expert(
-        0.9, "maximum overlap with every keyframe at which a frame becomes one", ge=0, le=1
     )
     keyframe_distance_m: float = _expert(
         1.0, "distance from all keyframes that makes a keyframe, if overlap is unknown", "m", gt=0

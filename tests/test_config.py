@@ -170,7 +170,7 @@ changed = st.fixed_dictionaries(
         "window": st.fixed_dictionaries(
             {
                 "size": st.none() | st.integers(2, 100),
-                "min_overlap": st.floats(0.0, 1.0),
+                "keyframe_distance_m": st.floats(1e-300, 1e300),
                 "kernel": st.sampled_from(["huber", "none", "dcs"]),
             }
         ),

@@ -18,6 +18,11 @@ from gvo.types import FloatArray
 
 _Id = TypeVar("_Id", bound=Hashable)
 
+MIN_OVERLAP = 0.4
+"""Least score of a keyframe that is linked: of views that share less, few corners are found."""
+KEYFRAME_OVERLAP = 0.9
+"""Largest score with every keyframe at which a frame becomes one: nine tenths in common say all."""
+
 
 def proximity(T_a_b: FloatArray, config: WindowConfig) -> float:
     """Score how near two poses are, without knowledge of the view.
@@ -27,30 +32,30 @@ def proximity(T_a_b: FloatArray, config: WindowConfig) -> float:
     T_a_b : ndarray of float64, shape (4, 4)
         Pose of one in the other, metres.
     config : WindowConfig
-        `keyframe_distance_m`, `keyframe_angle_deg` and `keyframe_overlap`.
+        `keyframe_distance_m` and `keyframe_angle_deg`.
 
     Returns
     -------
     float
-        1 at the same place, falling linearly to `keyframe_overlap` at the distance or the angle
+        1 at the same place, falling linearly to `KEYFRAME_OVERLAP` at the distance or the angle
         of a keyframe, whichever is reached first, and on to 0.
 
     Examples
     --------
     >>> T = np.eye(4)
     >>> T[2, 3] = 2.0
-    >>> round(proximity(T, WindowConfig(keyframe_distance_m=1.0, keyframe_overlap=0.9)), 6)
+    >>> round(proximity(T, WindowConfig(keyframe_distance_m=1.0)), 6)
     0.8
     """
     distance_ratio = float(np.linalg.norm(T_a_b[:3, 3])) / config.keyframe_distance_m
     angle_ratio = float(se3.rotation_angle(T_a_b)) / np.radians(config.keyframe_angle_deg)
     ratio = max(distance_ratio, float(angle_ratio))
-    return max(1.0 - (1.0 - config.keyframe_overlap) * ratio, 0.0)
+    return max(1.0 - (1.0 - KEYFRAME_OVERLAP) * ratio, 0.0)
 
 
-def is_needed(scores: Mapping[_Id, float], config: WindowConfig) -> bool:
+def is_needed(scores: Mapping[_Id, float]) -> bool:
     """Tell whether the current frame should become a keyframe."""
-    return max(scores.values(), default=0.0) < config.keyframe_overlap
+    return max(scores.values(), default=0.0) < KEYFRAME_OVERLAP
 
 
 def choose_links(
@@ -73,7 +78,7 @@ def choose_links(
     scores : mapping of frame to float
         Oldest first.
     config : WindowConfig
-        `n_links`, of which one goes to the predecessor, `min_overlap` and `link_gain`.
+        `n_links`, of which one goes to the predecessor, and `link_gain`.
     n_unasked : mapping of frame to int
         Steps since each was asked last, or since it itself; 0 where the view has not changed
         since.
@@ -87,9 +92,7 @@ def choose_links(
         More of them up to `n_links`, highest score first, to check doubtful steps.
     """
     n = config.n_links - 1
-    usable = [
-        frame for frame, score in scores.items() if score >= config.min_overlap and frame != exclude
-    ]
+    usable = [frame for frame, score in scores.items() if score >= MIN_OVERLAP and frame != exclude]
     gains = {frame: n_unasked[frame] * scores[frame] for frame in usable}
     telling = [frame for frame in usable if gains[frame] >= config.link_gain]
     chosen = sorted(telling, key=lambda frame: -gains[frame])[:n]
@@ -124,12 +127,12 @@ def choose_released(scores: Mapping[_Id, float], config: WindowConfig, *, n_kept
     scores : mapping of frame to float
         Oldest first.
     config : WindowConfig
-        `n_keyframes` and `min_overlap`.
+        `n_keyframes`.
     n_kept : int
         Number of keyframes, including the current one if it is one: it has no score, and is not
         released.
     """
-    far = [frame for frame, score in scores.items() if score < config.min_overlap]
-    near = [frame for frame, score in scores.items() if score >= config.min_overlap]
+    far = [frame for frame, score in scores.items() if score < MIN_OVERLAP]
+    near = [frame for frame, score in scores.items() if score >= MIN_OVERLAP]
     n_over = max(n_kept - len(far) - config.n_keyframes, 0)
     return far + sorted(near, key=lambda frame: scores[frame])[:n_over]

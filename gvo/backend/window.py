@@ -472,7 +472,7 @@ class SlidingWindow:
             kept_id: proximity(T_frame_world @ self.pose(kept_id), self._config)
             for kept_id in self.kept()
         }
-        if self._config.n_keyframes > 0 and is_needed(scores, self._config):
+        if self._config.n_keyframes > 0 and is_needed(scores):
             self.keep(frame_id)
         n_kept = len(scores) + int(self._poses[frame_id].is_kept)
         for kept_id in choose_released(scores, self._config, n_kept=n_kept):

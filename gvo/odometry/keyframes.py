@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg.lapack import dposv
 
 from gvo.backend.gating import disagreement
-from gvo.backend.keyframe_policy import choose_links, proximity
+from gvo.backend.keyframe_policy import MIN_OVERLAP, choose_links, proximity
 from gvo.backend.window import SlidingWindow
 from gvo.config import WindowConfig
 from gvo.frontend.protocol import HasPoints, ObservationsT
@@ -119,7 +119,7 @@ class Keyframes(Generic[ObservationsT]):
     def note_seen(self, scores: Mapping[int, float], n_steps: int) -> None:
         """Remember which keyframes are in view of the current frame."""
         for stamp_ns, score in scores.items():
-            if score >= self._config.min_overlap:
+            if score >= MIN_OVERLAP:
                 self._seen_at[stamp_ns] = n_steps
 
     def n_unseen(self, n_steps: int) -> dict[int, int]:

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from gvo.backend.keyframe_policy import choose_unseen, is_needed
+from gvo.backend.keyframe_policy import MIN_OVERLAP, choose_unseen, is_needed
 from gvo.backend.window import SlidingWindow
 from gvo.config import Config
 from gvo.frontend.calibration import RigOffsets
@@ -343,7 +343,7 @@ class Odometry:
         self._keyframes.note_seen(scores, step.n_steps)
         measure = partial(self._register_keyframe, observations, step)
         config = self._config.window
-        in_view = {ns: T for ns, T in T_frame_keyframes.items() if scores[ns] >= config.min_overlap}
+        in_view = {ns: T for ns, T in T_frame_keyframes.items() if scores[ns] >= MIN_OVERLAP}
         n_unasked = self._keyframes.n_unasked(in_view, step.n_steps)
         links = link_keyframes(
             measure, scores, T_frame_keyframes, step, config, n_unasked=n_unasked
@@ -486,7 +486,7 @@ class Odometry:
     def _is_keyframe_needed(self, scores: dict[int, float]) -> bool:
         config = self._config.window
         # A keyframe that cannot be registered stands for nothing that is in view.
-        return config.n_keyframes > 0 and is_needed(self._keyframes.registrable(scores), config)
+        return config.n_keyframes > 0 and is_needed(self._keyframes.registrable(scores))
 
     def _release_keyframes(self, scores: dict[int, float], n_steps: int) -> None:
         config, unjoined = self._config.window, self._unjoined()

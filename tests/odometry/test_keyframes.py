@@ -27,8 +27,6 @@ def keyframes(*stamps: int, **changes: Any) -> Keyframes[Observations]:
         "size": 3,
         "n_keyframes": 3,
         "n_links": 3,
-        "min_overlap": 0.3,
-        "keyframe_overlap": 0.75,
     }
     kept: Keyframes[Observations] = Keyframes(CAMERA, WindowConfig.model_validate(values | changes))
     for stamp in stamps:
@@ -117,7 +115,7 @@ def test_what_could_not_be_registered_does_not_stand_for_its_view() -> None:
 
 def test_steps_are_counted_since_a_keyframe_was_in_view() -> None:
     kept = keyframes(7, 8)
-    kept.note_seen({7: 0.3, 8: 0.29}, 5)
+    kept.note_seen({7: 0.4, 8: 0.39}, 5)
     assert kept.n_unseen(6) == {7: 1, 8: 6}
 
 
@@ -129,13 +127,13 @@ class Bare:
 
 
 def test_without_points_or_camera_the_score_is_the_proximity_of_the_poses() -> None:
-    config = WindowConfig(keyframe_distance_m=2.0, keyframe_overlap=0.8)
+    config = WindowConfig(keyframe_distance_m=2.0)
     pointless: Keyframes[Bare] = Keyframes(CAMERA, config)
     pointless.add(Bare(7))
     blind: Keyframes[Observations] = Keyframes(None, config)
     blind.add(observations_of(7, wall()))
     for kept in (pointless, blind):
-        for distance_m, score in ((0.0, 1.0), (2.0, 0.8), (5.0, 0.5), (50.0, 0.0)):
+        for distance_m, score in ((0.0, 1.0), (2.0, 0.9), (5.0, 0.75), (50.0, 0.0)):
             assert kept.scores({7: shifted(dz=distance_m)}) == {7: pytest.approx(score)}
 
 

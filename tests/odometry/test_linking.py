@@ -11,10 +11,11 @@ from gvo.odometry.chain import RawStep
 from gvo.odometry.keyframes import link_keyframes
 from gvo.types import Edge, Estimate, FloatArray, RelativePose, Status
 
-CONFIG = WindowConfig(n_links=3, min_overlap=0.3, link_gain=2.5, gate=10.0)
+CONFIG = WindowConfig(n_links=3, gate=10.0)
 # The first is chosen, the other is spare: two steps ago.
 SCORES = {10: 0.4, 80: 0.5}
 N_UNASKED = {10: 9, 80: 2}
+RECENTLY = {10: 4, 80: 2}
 SIGMA = 0.01
 
 
@@ -63,10 +64,12 @@ class Registrations:
         )
 
 
-def linked(measure: Registrations, step: RawStep, **changes: Any) -> list[Any]:
+def linked(
+    measure: Registrations, step: RawStep, n_unasked: dict[int, int] = N_UNASKED, **changes: Any
+) -> list[Any]:
     poses = {ns: forward(-0.1 * (100 - ns)) for ns in SCORES}
     config = CONFIG.model_copy(update=changes)
-    links = link_keyframes(measure, SCORES, poses, step, config, n_unasked=N_UNASKED)
+    links = link_keyframes(measure, SCORES, poses, step, config, n_unasked=n_unasked)
     return [link.reference_id for link in links]
 
 
@@ -77,7 +80,7 @@ def linked(measure: Registrations, step: RawStep, **changes: Any) -> list[Any]:
         *((sigmas, {}, [10, 80], [10, 80]) for sigmas in (10.1, -10.1, 1e6)),  # it contradicts it
         (None, {}, [10, 80], [80]),  # it fails
         (1e6, {"gate": None}, [10], [10]),  # nothing contradicts without a gate
-        (0.0, {"link_gain": 4.0}, [], []),  # steady steps tell as much
+        (0.0, {"n_unasked": RECENTLY}, [], []),  # steady steps tell as much
     ],
 )
 def test_links_are_asked_for_until_one_bears_out_the_step(
@@ -105,8 +108,8 @@ def test_the_prediction_is_the_motion_from_the_keyframe() -> None:
 
 def test_an_unsteady_step_is_checked_until_a_keyframe_bears_it_out() -> None:
     unsteady = step_of(is_steady=False)
-    assert linked(Registrations(), unsteady, link_gain=4.0) == [80]
-    assert linked(Registrations(of_80=1e6), unsteady, link_gain=4.0) == [80, 10]
-    assert linked(Registrations(of_80=None), unsteady, link_gain=4.0) == [10]
+    assert linked(Registrations(), unsteady, RECENTLY) == [80]
+    assert linked(Registrations(of_80=1e6), unsteady, RECENTLY) == [80, 10]
+    assert linked(Registrations(of_80=None), unsteady, RECENTLY) == [10]
     unregistered = step_of(is_registered=False)
-    assert linked(Registrations(), unregistered, link_gain=4.0) == [80, 10]
+    assert linked(Registrations(), unregistered, RECENTLY) == [80, 10]

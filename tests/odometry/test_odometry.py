@@ -232,9 +232,8 @@ def test_a_second_run_is_equal_bit_for_bit_whatever_the_threads(threads: int) ->
     "window",
     [
         {"size": 2, "n_keyframes": 0, "n_links": 1},
-        {"size": 12, "n_keyframes": 8, "n_links": 6, "keyframe_overlap": 0.97},
+        {"size": 12, "n_keyframes": 8, "n_links": 6},
         {"kernel": "cauchy"},
-        {"link_gain": 5.0},
     ],
 )
 def test_the_raw_chain_does_not_depend_on_the_window(window: dict[str, Any]) -> None:
@@ -329,7 +328,7 @@ def test_a_blank_image_is_coasted_over_without_a_jump() -> None:
 
 @pytest.mark.parametrize("n_keyframes", [0, 4])
 def test_a_gap_longer_than_the_window_is_bridged(n_keyframes: int) -> None:
-    config = configure(size=2, n_keyframes=n_keyframes, keyframe_overlap=0.5, n_links=1)
+    config = configure(size=2, n_keyframes=n_keyframes, n_links=1)
     results, smoothed = run(with_blanks(range(4, 9), 12), config)
     statuses = [result.status for result in results]
     assert statuses == (

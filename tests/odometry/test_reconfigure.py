@@ -125,7 +125,7 @@ def keyframes_over(config: Config, later: Config) -> tuple[tuple[int, ...], tupl
 
 
 def test_keyframes_stay_where_new_frames_can_be_registered_with_them() -> None:
-    many = change(Config(), window={"keyframe_overlap": 0.99})
+    many = Config()
     described = change(many, frontend={"kind": "descriptor"})
     for former, later in [
         (many, change(many, klt={"n_corners": 120})),
@@ -138,7 +138,7 @@ def test_keyframes_stay_where_new_frames_can_be_registered_with_them() -> None:
 
 
 def test_keyframes_of_other_descriptors_are_released() -> None:
-    many = change(Config(), window={"keyframe_overlap": 0.99}, frontend={"kind": "descriptor"})
+    many = change(Config(), frontend={"kind": "descriptor"})
     before, after = keyframes_over(many, change(many, features={"kind": "sift"}))
     assert len(before) > 1
     # The last frame was extracted again.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from gvo.backend.keyframe_policy import MIN_OVERLAP
 from gvo.config import Config
 from gvo.diagnostics.explain.extraction import explain_corner, explain_measured
 from gvo.diagnostics.explain.motion import Asked, OwnFrontend, explain_registration
@@ -222,6 +223,6 @@ class _Drive:
             return answer.reason
         if answer is not None:
             return "another frame must confirm it first"
-        if overlap < self._config.window.min_overlap:
+        if overlap < MIN_OVERLAP:
             return "too little overlap"
         return "other links add more, or the view has not changed since the last one"

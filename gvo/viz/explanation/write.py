@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from gvo.backend.keyframe_policy import KEYFRAME_OVERLAP, MIN_OVERLAP
 from gvo.diagnostics.explain.values import FrameExplanation, Link, Registration, Sorting
 from gvo.errors import ConfigurationError, write_faults
 from gvo.types import ConstantError, FloatArray, StereoFrame
@@ -67,6 +68,8 @@ def write_explanation(explanation: FrameExplanation, out: Path) -> list[Path]:
             poses=_poses(explanation),
             count_words=count_words,
             median=np.median,
+            min_overlap=MIN_OVERLAP,
+            keyframe_overlap=KEYFRAME_OVERLAP,
             **_lengths(found),
         )
     return [*files, page]

@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 import gvo
+from gvo.backend.keyframe_policy import MIN_OVERLAP
 from gvo.config import Config
 from gvo.diagnostics.explain import explain_frame
 from gvo.errors import GvoError
@@ -114,7 +115,7 @@ def test_each_keyframe_has_an_edge_or_the_reason_why_not(kind: str) -> None:
     for link in links:
         assert bool(link.reason) != link.is_accepted
         if link.reason == "too little overlap":
-            assert link.overlap < config.window.min_overlap
+            assert link.overlap < MIN_OVERLAP
     assert {"step", "not linked"} <= {link.kind for link in links}
     assert explanation.result.n_links == sum(link.is_accepted for link in links)
     assert [(each.n_done, each.n_total, each.n_tracked) for each in done] == [
