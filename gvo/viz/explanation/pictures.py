@@ -16,6 +16,7 @@ from gvo.diagnostics.explain.values import (
     Sorting,
 )
 from gvo.frontend.klt import image_of
+from gvo.geometry.refinement import GATE
 from gvo.types import FloatArray, RelativePose, RgbdFrame, StereoFrame
 from gvo.viz.figures import (
     Plot,
@@ -235,12 +236,11 @@ def _draw_consensus(explanation: FrameExplanation) -> Plot:
         axes.plot(*ends[chosen].T, marker, color=colour, markersize=4, label=label)
     axes.legend(loc="upper right", frameon=True, framealpha=0.8)
     for part in lower:
-        gate = explanation.config.registration.gate
-        _draw_residuals(part.subplots(1, 4), registration, gate)
+        _draw_residuals(part.subplots(1, 4), registration)
     return _picture("4_consensus", figure)
 
 
-def _draw_residuals(panels: Any, registration: Registration, gate: float) -> None:  # noqa: ANN401
+def _draw_residuals(panels: Any, registration: Registration) -> None:  # noqa: ANN401
     residuals_px, whitened = registration.residuals_px, registration.whitened
     if residuals_px is None or whitened is None:
         return
@@ -253,8 +253,8 @@ def _draw_residuals(panels: Any, registration: Registration, gate: float) -> Non
     panels[0].set_ylabel("matches")
     panels[0].legend(loc="upper left")
     lengths = np.nan_to_num(np.linalg.norm(whitened, axis=2), nan=np.inf)
-    _compare(panels[3], lengths, np.linspace(0.0, 3.0 * gate, 31))
-    panels[3].axvline(gate, color=_LIMIT, linestyle="--", label=f"gate {gate:g}")
+    _compare(panels[3], lengths, np.linspace(0.0, 3.0 * GATE, 31))
+    panels[3].axvline(GATE, color=_LIMIT, linestyle="--", label=f"gate {GATE:g}")
     panels[3].set(xlabel="norm [sigma]")
     panels[3].legend(loc="upper right")
 
