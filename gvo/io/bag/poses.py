@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -19,6 +19,8 @@ from gvo.io.edges.events import InputFaults
 from gvo.io.edges.pose_streams import PoseStream
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FloatArray
+
+_Value = TypeVar("_Value")
 
 _TRANSFORM_TYPE = "geometry_msgs/msg/TransformStamped"
 _COVARIANCE_TYPES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseWithCovarianceStamped")
@@ -108,25 +110,37 @@ def pose_messages(
 
     Messages that hold none, or are of other frames than the first, are skipped and counted.
     """
-    n_messages = 0
     first: tuple[str, str] | None = None
-    for message in reader.messages([topic.name]):
-        if message.topic.type != topic.type:
-            continue
-        n_messages += 1
-        try:
-            content = message.decode()
-            pose = _pose(content, topic)
-        except RecordingError as error:
-            faults.add("messages hold no pose and were skipped", str(error))
-            continue
-        frames = pose.child_frame, bare(content.header.frame_id)
+    for header, pose in _values(reader, topic, _pose, "pose", faults):
+        frames = pose.child_frame, bare(header.frame_id)
         first = first or frames
         if frames == first:
             yield pose
         else:
             reason = "{} in {} in place of {} in {}".format(*frames, *first)
             faults.add("messages are of other frames and were skipped", reason)
+
+
+def _values(
+    reader: MessageReader,
+    topic: Topic,
+    value_of: Callable[[Any, Topic], _Value],
+    name: str,
+    faults: InputFaults,
+) -> Iterator[tuple[Any, _Value]]:
+    """Yield header and value of each message of a topic; skip and count what holds none."""
+    n_messages = 0
+    for message in reader.messages([topic.name]):
+        if message.topic.type != topic.type:
+            continue
+        n_messages += 1
+        try:
+            content = message.decode()
+            value = value_of(content, topic)
+        except RecordingError as error:
+            faults.add(f"messages hold no {name} and were skipped", str(error))
+        else:
+            yield content.header, value
     if n_messages == 0:
         raise RecordingError(
             f"{topic.name} announces {topic.n_messages} messages but yields none; record or "
@@ -176,20 +190,12 @@ def read_positions(reader: MessageReader, topic: Topic, faults: InputFaults) -> 
     """
     rows: dict[int, FloatArray] = {}
     frame = ""
-    for message in reader.messages([topic.name]):
-        if message.topic.type != topic.type:
-            continue
-        try:
-            content = message.decode()
-            numbers = _numbers(content, topic)
-        except RecordingError as error:
-            faults.add("messages hold no position and were skipped", str(error))
-            continue
+    for header, numbers in _values(reader, topic, _numbers, "position", faults):
         if not rows:  # the first one's counts: neither fixes nor points change theirs
-            frame = bare(content.header.frame_id)
-        rows[stamp_of(content.header)] = numbers
+            frame = bare(header.frame_id)
+        rows[stamp_of(header)] = numbers
     if not rows:
-        reason = "; ".join(faults.warnings()) or f"none of {topic.n_messages} messages is there"
+        reason = "; ".join(faults.warnings())
         raise RecordingError(f"{topic.name}: holds no position: {reason}")
     stamps_ns = np.array(sorted(rows), dtype=np.int64)
     places = np.stack([rows[int(stamp_ns)] for stamp_ns in stamps_ns])
