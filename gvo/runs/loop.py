@@ -17,7 +17,6 @@ from gvo.io.excerpt import Excerpt
 from gvo.io.frames import Through, frames, is_lost, one_opencv_thread
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import Source
-from gvo.odometry.graph import Table
 from gvo.odometry.odometry import Odometry
 from gvo.runs.statistics import RunStatistics
 from gvo.trajectory.evaluation import Motions
@@ -28,9 +27,6 @@ _LOGGER = logging.getLogger(__name__)
 # Once per span the window gives the motion over it, to compare covariances with the truth.
 _SPAN_NS = 1_000_000_000
 _MOST_OFF_NS = 500_000_000
-_EDGE = np.dtype(
-    [("reference_id", "i8"), ("T_reference_frame", "f8", (4, 4)), ("covariance", "f8", (6, 6))]
-)
 
 
 class Output(Protocol):
@@ -72,6 +68,9 @@ class RunLoop:
         Which frames are read.
     statistics : RunStatistics
         Counts so far.
+    edges : list of (int, Edge)
+        Motions of the base frame over about 1 s as the window had them, about one a second: the
+        stamp of a frame, and the edge to it from a frame about 1 s earlier.
     output_faults : list of str
         Why outputs could not be written completely.
     take_waited_s : callable
@@ -99,7 +98,7 @@ class RunLoop:
         self._first_ns: int | None = None
         self._previous_ns: int | None = None
         self._outputs: list[Output] = []
-        self._edges = Table(_EDGE)
+        self.edges: list[tuple[int, Edge]] = []
         self.output_faults: list[str] = []
         self.take_waited_s: Callable[[], float] = lambda: 0.0
         self.on_tracked: Callable[[Frame | FaultyFrame, FrameResult | None], None] | None = None
@@ -110,15 +109,6 @@ class RunLoop:
     def window(self) -> SlidingWindow:
         """The window of the odometry, for `on_tracked` to read."""
         return self._odometry.window
-
-    @property
-    def edges(self) -> list[tuple[int, Edge]]:
-        """Motions of the base frame over about 1 s as the window had them, about one a second.
-
-        Each is the stamp of a frame and the edge to it from a frame about 1 s earlier.
-        """
-        stamps_ns = enumerate(self._edges.stamps_ns)
-        return [(stamp_ns, Edge(**self._edges.fields(k))) for k, stamp_ns in stamps_ns]
 
     @property
     def is_placed(self) -> bool:
@@ -273,7 +263,7 @@ class RunLoop:
         self._asked_ns = stamp_ns
         edge = edge_over(self._odometry.window, stamp_ns, _SPAN_NS)
         if edge is not None:
-            self._edges.append_fields(stamp_ns, self.base_frame.apply_to_edge(stamp_ns, edge))
+            self.edges.append((stamp_ns, self.base_frame.apply_to_edge(stamp_ns, edge)))
 
     def _take_faulty(self, item: FaultyFrame) -> None:
         is_loss = is_lost(item, self.source.info.sensor)

@@ -246,9 +246,8 @@ def _conclude(
         raise _nothing_to_smooth(notes)
     estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
     summary = {**_summary(smoother), "configuration": smoother.config.model_dump()}
-    is_complete = not (smoother.window.counts.n_coasting or smoother.window.counts.n_rejected)
-    warnings = list(_warnings(smoother))
-    return _written(folder, summary, estimates, truth, notes, warnings, is_complete, on_written)
+    notes.warnings = [*_warnings(smoother), *notes.warnings]
+    return _written(folder, summary, estimates, truth, notes, on_written)
 
 
 def _nothing_to_smooth(notes: SmoothingNotes) -> RecordingError:
@@ -263,21 +262,19 @@ def _written(
     estimates: dict[str, Trajectory],
     truth: Trajectory | None,
     notes: SmoothingNotes,
-    warnings: list[str],
-    is_complete: bool,
     on_written: Callable[[], None] | None,
 ) -> RunResult:
-    """Compare with the truth; write the summary and the picture."""
+    """Compare with the truth; write the summary and the picture. Any warning is incomplete."""
     evaluations: tuple[Evaluation, ...] = ()
     if truth is not None:
         try:
             evaluations = tuple(evaluate(truth, e, name=name) for name, e in estimates.items())
         except GvoError as error:
             notes.warnings.append(f"not compared with the ground truth: {error}")
+    warnings = notes.warnings
     if notes.broken_off:
         cut = f"the input broke off after {summary['frames']} poses: {notes.broken_off}"
         warnings = [cut, *warnings]
-    warnings = [*warnings, *notes.warnings]
     summary |= {"errors": evaluations_json(evaluations)["estimates"], "warnings": warnings}
     with _poses_counted(folder.path):
         folder.write_summary(summary)
@@ -287,7 +284,7 @@ def _written(
         from gvo.viz.plots import plot_trajectories
 
         plot_trajectories(folder.path / PICTURE, truth if evaluations else None, estimates)
-    is_complete &= not (notes.broken_off or notes.warnings)
+    is_complete = not warnings
     return RunResult(
         summary=summary, evaluations=evaluations, is_complete=is_complete, warnings=tuple(warnings)
     )
@@ -477,9 +474,9 @@ def optimize_edges(
                     poses.append((graph.stamps_ns[number], graph.frame_ids[number], T))
     estimates = {"raw": optimizer.trajectory(of=optimizer.raw), "smoothed": smoothed}
     truth = _with_stamps(ground_truth, source, folder)
-    warnings = list(_batch_warnings(graph, optimizer))
     summary = _batch_summary(graph, optimizer, robust, notes)
-    return _written(folder, summary, estimates, truth, notes, warnings, not warnings, on_written)
+    notes.warnings = [*_batch_warnings(graph, optimizer), *notes.warnings]
+    return _written(folder, summary, estimates, truth, notes, on_written)
 
 
 def _batch_summary(

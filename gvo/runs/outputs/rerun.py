@@ -39,7 +39,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -79,8 +78,6 @@ N_FRAMES_HELD: Final = 20
 """Frames after which what was logged must be in the file."""
 N_SIGMAS: Final = 3.0
 """Half-axes of an ellipsoid, in standard deviations."""
-SHOWN_WIDTH_PX: Final = 640
-"""Images in the scene are halved until they are no wider."""
 EARLIEST_DATE_NS: Final = 946_684_800 * 10**9
 """1 January 2000: stamps before that are no dates but durations since a start."""
 
@@ -179,7 +176,7 @@ class RunRerun(FileOutput):
         image = image_of(frame)
         overlay = compose_overlay(frame, result, self._camera, index=self._n_seen - 1)
         self._log(_OVERLAY, _picture(overlay))
-        self._log(f"{_CAMERA}/image", _picture(_halve(image)))
+        self._log(f"{_CAMERA}/image", _picture(image))
         self._add_poses(seen)
         self._add_points(image, seen, is_keyframe=result.stamp_ns in result.keyframes_ns)
         self._add_lines(seen)
@@ -400,31 +397,10 @@ def _picture(image: ImageArray) -> rr.EncodedImage:
     return rr.EncodedImage(contents=encode_image(image, ".jpg"), media_type="image/jpeg")
 
 
-def _halve(image: ImageArray) -> ImageArray:
-    """Return an image (height, width) for the scene, at most `SHOWN_WIDTH_PX` wide."""
-    n = _shrinkage(image.shape[1])
-    if n == 1:
-        return image
-    height, width = (size // n for size in image.shape)
-    cropped = image[: height * n, : width * n]
-    return np.asarray(cv2.resize(cropped, (width, height), interpolation=cv2.INTER_AREA))
-
-
 def _pinhole(camera: PinholeCamera) -> rr.Pinhole:
-    """Return the camera of what `_halve` returns."""
-    n = _shrinkage(camera.width)
-    # Pixel (0, 0) is the centre of the first pixel: its corner is where sizes are scaled about.
     return rr.Pinhole(
-        focal_length=[camera.fx / n, camera.fy / n],
-        principal_point=[(camera.cx + 0.5) / n - 0.5, (camera.cy + 0.5) / n - 0.5],
-        resolution=[camera.width // n, camera.height // n],
+        focal_length=[camera.fx, camera.fy],
+        principal_point=[camera.cx, camera.cy],
+        resolution=[camera.width, camera.height],
         camera_xyz=rr.ViewCoordinates.RDF,
     )
-
-
-def _shrinkage(width: int) -> int:
-    """Return the factor that shrinks an image of this width for the scene: 1, 2, 4, ..."""
-    n = 1
-    while width // n > SHOWN_WIDTH_PX:
-        n *= 2
-    return n
