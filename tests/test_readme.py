@@ -123,3 +123,11 @@ def test_what_the_readme_says_that_gvo_has_not_is_not_there() -> None:
     assert "it has no IMU, no monocular mode and no maps that\nare kept" in README
     assert get_args(Sensor) == ("stereo", "rgbd")
     assert not any(re.search("I(?:mu|MU)|Mono|Lidar|LiDAR", name) for name in gvo.__all__)
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/installation.md"])
+def test_every_extra_that_a_page_names_is_there(page: str) -> None:
+    named = re.findall(r"pip install (?:-e )?'\.\[(.*?)\]'", (ROOT / page).read_text())
+    extras = {extra for names in named for extra in names.split(",")}
+    assert extras
+    assert extras <= set(PROJECT["optional-dependencies"])

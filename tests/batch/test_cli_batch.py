@@ -3,7 +3,6 @@
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -159,26 +158,12 @@ def test_workers_that_cannot_be_started_are_a_line(
     assert "Traceback" not in answer.err
 
 
-def test_configurations_alone_are_misuse(command: Command, tmp_path: Path) -> None:
-    (tmp_path / "a.yaml").touch()
-    said = refused(command("batch", tmp_path / "a.yaml", "--out", tmp_path / "out"))
-    assert "expected a recording" in said
-
-
 def test_without_a_package_it_says_how_to_get_it(bags: Path, tmp_path: Path) -> None:
     program = f"import sys; sys.modules['dask'] = None\n{GVO[-1]}"
     said = refused(python("-c", program, "batch", bags, "--out", tmp_path / "out"))
     assert "batches need dask; install it by: " in said
     assert "[batch]'" in said
     assert not (tmp_path / "out").exists()
-
-
-def test_without_the_package_of_keys_it_says_how_to_get_it(
-    command: Command, bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "cryptography", None)
-    said = refused(command("batch", bags, "--out", tmp_path / "out"))
-    assert "batches need cryptography; install it by: " in said
 
 
 @pytest.mark.acceptance

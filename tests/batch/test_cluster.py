@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 from distributed import Client
 
-import gvo
 from gvo.batch import BatchProgress, run
 from tests.batch.conftest import NO_REPORT, Cluster, is_complete, is_under_way, wait_until
 from tests.conftest import GVO, Command, assert_same_files
@@ -67,34 +66,3 @@ def test_a_scheduler_that_is_lost_is_a_line_and_the_batch_goes_on_with_another(
     answer = command("batch", *asked, *options)
     assert answer.code == 0, answer.err
     assert answer.err.count("complete, found") == 1
-
-
-@pytest.mark.acceptance
-@pytest.mark.linux
-def test_a_worker_with_another_disk_or_version_says_so(
-    tmp_path: Path, bags: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One that stands elsewhere sees something else where a path leads by where one stands."""
-    here, there = tmp_path / "here", tmp_path / "there"
-    here.mkdir()
-    there.mkdir()
-    (tmp_path / "older.py").write_text(
-        "import gvo.batch.tasks\ngvo.batch.tasks.__version__ = '0'\n"
-    )
-    (tmp_path / "cluster").mkdir()
-    cluster = Cluster(tmp_path / "cluster")
-    monkeypatch.chdir(here)
-    try:
-        other_disk = cluster.add_worker(cwd=there)
-        with Client(cluster.address) as client:
-            table = run(bags, out="/proc/self/cwd/out", client=client, options=NO_REPORT)
-            assert set(table["status"]) == {"failed"}
-            assert all("a disk that both share" in reason for reason in table["reason"])
-            assert list(there.iterdir()) == []
-            cluster.kill_worker(other_disk)
-            cluster.add_worker("--preload", str(tmp_path / "older.py"))
-            table = run(bags, out=tmp_path / "out", client=client, options=NO_REPORT)
-    finally:
-        cluster.close()
-    expected = f"the worker has gvo 0, the client {gvo.__version__}: install one"
-    assert table["reason"].tolist() == [expected] * 3

@@ -16,7 +16,7 @@ from distributed import Client
 from gvo.batch.engine import BatchProgress, ClusterError, Engine, connected
 from gvo.batch.inputs import NamedRecording, make_variants
 from gvo.batch.running import make_tasks
-from gvo.batch.tasks import MARK, BatchRow, Task, TaskOptions
+from gvo.batch.tasks import MARK, Task, TaskOptions
 from tests.batch.conftest import NO_REPORT, is_complete, wait_until
 
 N_MANY = 300
@@ -102,34 +102,6 @@ def test_an_exception_of_any_kind_is_a_row_with_its_reason(
     rows = {row.folder: row for row in Engine(near, options).run(tasks)}
     assert (rows["r0"].status, rows["r0"].reason) == ("failed", "LookupError: what?")
     assert "does not exist" in rows["r1"].reason
-
-
-def test_progress_counts_what_is_done(near: Client, options: TaskOptions, bags: Path) -> None:
-    tasks = tasks_of(bags / "walk0.mcap", "/none.bag", bags / "walk1.mcap")
-    first: list[BatchProgress] = []
-    list(Engine(near, options, first.append).run(tasks))
-    assert (first[0].n_done, first[0].n_total, first[0].n_found) == (1, 3, 0) or first[
-        0
-    ].row is None
-    last = first[-1]
-    assert (last.n_done, last.n_total, last.n_found, last.n_failed) == (3, 3, 0, 1)
-    assert (last.n_workers, last.left_s) == (1, 0.0)
-    assert sum(progress.row is not None for progress in first) == 3
-    again: list[BatchProgress] = []
-    list(Engine(near, options, again.append).run(tasks))
-    assert (again[-1].n_found, again[-1].n_failed) == (2, 1)
-
-
-def test_what_a_caller_raises_ends_the_whole_batch(near: Client, options: TaskOptions) -> None:
-    def stop(progress: BatchProgress) -> None:
-        if progress.n_done == 3:
-            raise KeyboardInterrupt
-
-    rows: list[BatchRow] = []
-    with pytest.raises(KeyboardInterrupt):
-        rows.extend(Engine(near, options, stop).run(missing(N_MANY)))
-    assert near.futures == {}
-    wait_until(lambda: known_to_scheduler(near) == 0, "the scheduler forgets them")
 
 
 class Killer:

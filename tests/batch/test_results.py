@@ -1,6 +1,5 @@
 """The table holds what the rows hold, and the file gives it back."""
 
-from dataclasses import asdict
 from pathlib import Path
 
 import pandas as pd
@@ -46,17 +45,6 @@ def test_the_file_gives_the_table_back(tmp_path: Path) -> None:
     )
     assert_the_file_gives_it_back(frame, tmp_path)
     assert pd.read_csv(tmp_path / CSV)["ate_smoothed_m"].tolist()[0] == 0.1 + 0.2
-
-
-def test_every_field_of_a_row_has_its_column() -> None:
-    row = complete(**MEASURED, parameters={"window.size": 4})
-    frame = to_frame([row])
-    values = asdict(row)
-    del values["parameters"]
-    assert set(frame.columns) == {*values, "window.size"}
-    for name, value in values.items():
-        found = frame[name].iloc[0]
-        assert pd.isna(found) if value is None else found == value, name
 
 
 @pytest.mark.parametrize("name", HOSTILE)

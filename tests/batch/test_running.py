@@ -1,6 +1,5 @@
 """A batch leaves a folder for each run, a table and a page, however it ends."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,20 +8,12 @@ import pandas as pd
 import pytest
 from distributed import Client
 
-import gvo
-import gvo.batch
 from gvo.batch import BatchOptions, BatchProgress, run
-from gvo.batch.inputs import NamedRecording, make_variants
-from gvo.batch.running import make_tasks
 from gvo.errors import OutputError
 from tests.batch.conftest import NO_REPORT, state_of
 from tests.conftest import assert_same_files
 
 FORCED = BatchOptions(report=False, force=True)
-
-
-def with_size(size: int) -> gvo.Config:
-    return gvo.load_configuration(settings=[f"window.size={size}", "runtime.threads=1"])
 
 
 def run_files(out: Path) -> dict[Path, Any]:
@@ -61,23 +52,6 @@ def test_what_is_finished_is_found_the_rest_run(near: Client, bags: Path, tmp_pa
     }
     columns = ["recording", "status", "ate_smoothed_m", "run_hash", "configuration_hash"]
     pd.testing.assert_frame_equal(forced[columns], table[columns])
-
-
-def test_configurations_have_folders_and_columns(near: Client, bags: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    configs = {"small": with_size(2), "large": with_size(9)}
-    asked = [bags / "walk0.mcap", bags / "walk1.mcap"]
-    table = run(asked, configs, out=out, client=near, options=NO_REPORT)
-    names = [f"walk{n}/{variant}" for n in range(2) for variant in configs]
-    assert table["folder"].tolist() == names
-    assert table["window.size"].tolist() == [2, 9, 2, 9]
-    assert table["configuration_hash"].nunique() == 2
-    for name, size in zip(names, [2, 9, 2, 9], strict=True):
-        summary = json.loads((out / name / "summary.json").read_text())
-        assert summary["configuration"]["window"]["size"] == size
-    single = run(asked, [with_size(2)], out=tmp_path / "b", client=near, options=NO_REPORT)
-    assert "window.size" not in single.columns
-    assert_same_files(out / "walk0" / "small", tmp_path / "b" / "walk0")
 
 
 class StoppedError(Exception):
@@ -133,14 +107,3 @@ def test_a_table_that_cannot_be_written_ends_the_batch(
     # Though the error, and with it all that it went through, is still held.
     assert near.futures == {}
     assert error is not None
-
-
-def test_tasks_are_all_pairs_in_folders_of_their_own() -> None:
-    recordings = [NamedRecording(name=name, location=f"/{name}.bag") for name in "ab"]
-    variants = make_variants(sweeps=["window.size=3,4", "window.gate=null,9.5"])
-    tasks = make_tasks(recordings, variants)
-    assert len(tasks) == 8
-    assert len({task.folder for task in tasks}) == 8
-    assert tasks[1].parameters == {"window.size": 3, "window.gate": 9.5}
-    (single,) = make_tasks(recordings[:1], variants[:1])
-    assert (single.folder, single.parameters) == ("a", {})

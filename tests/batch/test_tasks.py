@@ -15,7 +15,7 @@ from gvo.batch.tasks import MARK, BatchOptions, BatchRow, Task, TaskOptions, run
 from gvo.io.excerpt import Excerpt
 from gvo.io.run_folder.writer import written_alone
 from gvo.types import Progress
-from tests.batch.conftest import N_FRAMES, NO_REPORT, copy_of, state_of
+from tests.batch.conftest import N_FRAMES, NO_REPORT, copy_of
 from tests.conftest import assert_same_files
 
 CONFIG = gvo.load_configuration(settings=["runtime.threads=1"])
@@ -39,18 +39,6 @@ def bag(bags: Path, tmp_path: Path) -> Path:
     return copy_of(bags / "walk0.mcap", tmp_path / "in", "walk.mcap")
 
 
-class StopError(Exception):
-    """Ends a run."""
-
-
-def stop_at(n_frames: int, error: type[BaseException]) -> Callable[[Progress], None]:
-    def check(progress: Progress) -> None:
-        if progress.n_done >= n_frames:
-            raise error
-
-    return check
-
-
 def test_a_task_writes_what_a_run_writes(
     bag: Path, options: TaskOptions, run_alone: Callable[[Path], Path]
 ) -> None:
@@ -69,15 +57,6 @@ def test_a_task_writes_what_a_run_writes(
     assert row.rpe_smoothed_deg == errors["smoothed"]["rpe_deg"]
     assert row.run_s is not None
     assert (row.gvo_version, row.is_found) == (gvo.__version__, False)
-
-
-def test_a_finished_run_is_found_and_not_touched(bag: Path, options: TaskOptions) -> None:
-    first = run_task(task_of(bag), options)
-    before = state_of(options.out)
-    second = run_task(task_of(bag), options)
-    assert state_of(options.out) == before
-    assert (second.is_found, second.run_s) == (True, None)
-    assert replace(second, is_found=False, run_s=first.run_s) == first
 
 
 @pytest.mark.parametrize("change", ["configuration", "recording", "excerpt"])
@@ -99,19 +78,6 @@ def test_another_run_in_the_folder_is_replaced(
     assert (row.status, row.is_found) == ("complete", False)
     run_task(task, fresh)
     assert_same_files(options.out / "a", tmp_path / "fresh" / "a")
-
-
-def test_an_interrupted_run_begins_anew(
-    bag: Path, options: TaskOptions, run_alone: Callable[[Path], Path]
-) -> None:
-    for error in (StopError, KeyboardInterrupt):
-        with pytest.raises(error):
-            run_task(task_of(bag), options, on_progress=stop_at(5, error))
-    seen: list[int] = []
-    row = run_task(task_of(bag), options, on_progress=lambda progress: seen.append(progress.n_done))
-    assert (row.status, row.is_found) == ("complete", False)
-    assert seen == list(range(1, N_FRAMES + 1))
-    assert_same_files(options.out / "a", run_alone(bag))
 
 
 def test_a_recording_that_fails_is_a_row_and_reason(options: TaskOptions, tmp_path: Path) -> None:

@@ -8,19 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import gvo
 from gvo.batch import Variant, make_variants
 from gvo.errors import ConfigurationError
 
 
 def values_of(variant: Variant) -> tuple[int | None, int]:
     return variant.config.window.size, variant.config.window.n_links
-
-
-def test_without_anything_there_is_the_default_on_one_thread() -> None:
-    (variant,) = make_variants()
-    assert variant.name == "default"
-    assert variant.config == gvo.load_configuration(settings=["runtime.threads=1"])
 
 
 @given(
@@ -36,17 +29,6 @@ def test_values_are_taken_as_they_are_written(sizes: list[int], gates: list[floa
     found = [(variant.config.window.size, variant.config.window.gate) for variant in variants]
     assert found == list(itertools.product(sizes, gates))
     assert len({variant.name for variant in variants}) == len(variants)
-
-
-def test_files_settings_and_sweeps_go_together(tmp_path: Path) -> None:
-    for name, size in (("small", 3), ("large", 9)):
-        (tmp_path / f"{name}.yaml").write_text(f"window: {{size: {size}, n_links: 2}}\n")
-    files = [tmp_path / "small.yaml", tmp_path / "large.yaml"]
-    variants = make_variants(files, ["ransac.seed=7"], ["window.n_links=1,3"])
-    assert list(map(values_of, variants)) == [(3, 1), (3, 3), (9, 1), (9, 3)]
-    assert {variant.config.ransac.seed for variant in variants} == {7}
-    assert variants[0].name == "small,window.n_links=1"
-    assert [each.name for each in make_variants(files)] == ["small", "large"]
 
 
 def test_files_of_one_name_are_told_apart_and_one_file_is_one(tmp_path: Path) -> None:

@@ -1,10 +1,8 @@
 """Bags as people have them, on the command line: split, cut, with tf and truth; bags of runs."""
 
-import csv
 import json
 import shutil
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +13,10 @@ from scipy.spatial.transform import Rotation
 import gvo
 from gvo.geometry import se3
 from gvo.geometry.se3 import make_transform
-from gvo.io.recording import StampedImage
 from gvo.trajectory.formats import read_trajectory
 from gvo.types import FloatArray
 from tests.conftest import Command, assert_same_files, refused
-from tests.make.bags import ODOMETRY, PoseBag
+from tests.make.bags import ODOMETRY
 from tests.make.rendered_walk import (
     CAMERA,
     N_FRAMES,
@@ -39,11 +36,6 @@ from tests.make.rendered_walk import (
 
 def poses(folder: Path, name: str) -> FloatArray:
     return read_trajectory(folder / f"{name}.txt").T_world_frame
-
-
-def frame_stamps(folder: Path) -> list[int]:
-    with (folder / "frames.csv").open() as file:
-        return [int(row["stamp_ns"]) for row in csv.DictReader(file)]
 
 
 @pytest.fixture(scope="module")
@@ -121,16 +113,6 @@ def test_the_initial_pose_moves_all_poses(
         np.testing.assert_allclose(mine, theirs, rtol=1e-9, atol=1e-18)
 
 
-def test_only_the_excerpt_is_run(command: Command, walk_bag: Path, tmp_path: Path) -> None:
-    options = ["--start", "0.25", "--duration", "0.8", "--every", "3"]
-    answer = command("run", "--no-report", walk_bag, "--out", tmp_path, *options)
-    assert answer.code == 0, answer.err
-    elapsed_s = (STAMPS_NS - STAMPS_NS[0]) / 1e9
-    chosen = STAMPS_NS[(elapsed_s >= 0.25) & (elapsed_s < 1.05)][::3]
-    assert frame_stamps(tmp_path) == chosen.tolist()
-    np.testing.assert_allclose(poses(tmp_path, "raw")[0], np.eye(4), atol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -200,12 +182,6 @@ def test_bags_of_two_recordings_are_refused_with_what_to_type(
     assert f"`gvo batch {tmp_path if is_folder else bags[0]}" in said
 
 
-def test_the_bag_of_a_run_is_no_recording(command: Command, walk_bag: Path, tmp_path: Path) -> None:
-    bag = PoseBag(tmp_path / "run.mcap")
-    bag.pose("/gvo/raw/odometry", ODOMETRY, int(STAMPS_NS[0]), np.eye(4), child="camera")
-    assert "run.mcap was written by a run" in refused(command("check", walk_bag, bag.write()))
-
-
 @pytest.mark.parametrize("suffix", [".bag", ".mcap"])
 def test_of_a_cut_bag_what_can_be_read_is_run(
     command: Command, walk_run: Path, tmp_path: Path, suffix: str
@@ -229,68 +205,8 @@ def test_of_a_cut_bag_what_can_be_read_is_run(
     assert len(read_bag(tmp_path / "out.mcap")["/gvo/raw/odometry"]) == n
 
 
-@pytest.mark.parametrize(("suffix", "frame"), [(".mcap", "base_link"), (".bag", None)])
-def test_the_bag_of_a_run_holds_the_poses_of_its_files(
-    command: Command, robot_bag: Path, tmp_path: Path, frame: str | None, suffix: str
-) -> None:
-    path, out = tmp_path / f"run{suffix}", tmp_path / "out"
-    options = [] if frame is None else ["--frame", frame]
-    answer = command("run", "--no-report", robot_bag, "--out", out, "--bag", path, *options)
-    assert (answer.code, answer.err) == (0, "")
-    messages = read_bag(path)
-    for name in TRAJECTORIES:
-        found = {}
-        for _, content in messages[f"/gvo/{name}/odometry"]:
-            assert content.child_frame_id == f"gvo/{name}/{frame or CAMERA}"
-            found[stamp_ns(content.header)] = matrix(content.pose.pose)
-        trajectory = read_trajectory(out / f"{name}.txt")
-        assert sorted(found) == trajectory.stamps_ns.tolist()
-        np.testing.assert_allclose(
-            np.array([found[stamp] for stamp in sorted(found)]), trajectory.T_world_frame, atol=2e-9
-        )
-    compared = command("compare", out / "raw.txt", f"{path}#/gvo/raw/odometry", "--json")
-    assert json.loads(compared.out)["estimates"][0]["ate_m"] < 1e-8
-    path_poses = messages["/gvo/smoothed/path"][-1][1].poses
-    assert [stamp_ns(pose.header) for pose in path_poses] == STAMPS_NS.tolist()
-
-
 def stamp_ns(header: Any) -> int:
     return int(header.stamp.sec * 10**9 + header.stamp.nanosec)
-
-
-def matrix(pose: Any) -> FloatArray:
-    q, t = pose.orientation, pose.position
-    R = np.asarray(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix())
-    return make_transform(R, np.array([t.x, t.y, t.z]))
-
-
-def findings(answer: Any) -> dict[str, str]:
-    result = json.loads(answer.out)
-    assert set(result) == {"recording", "is_healthy", "n_warnings", "n_faults", "findings"}
-    return {finding["name"]: finding["verdict"] for finding in result["findings"]}
-
-
-def test_check_finds_nothing_on_a_clean_bag(command: Command, robot_bag: Path) -> None:
-    answer = command("check", robot_bag)
-    assert (answer.code, answer.err) == (0, "")
-    assert answer.out.splitlines()[-1] == "robot: healthy"  # else it counts faults and warnings
-
-
-class Exchanged(Walk):
-    """The images of the left camera on the topic of the right one, and the other way round."""
-
-    def images(self) -> Iterator[StampedImage]:
-        for image in super().images():
-            yield replace(image, stream=1 - image.stream)
-
-
-def test_check_finds_the_images_exchanged(command: Command, tmp_path: Path) -> None:
-    gvo.convert(Exchanged(), tmp_path / "exchanged.mcap")
-    answer = command("check", tmp_path / "exchanged.mcap", "--json")
-    assert (answer.code, answer.err) == (1, "")
-    assert [name for name, verdict in findings(answer).items() if verdict == "fault"] == [
-        "left/right: order"
-    ]
 
 
 @pytest.mark.recorded

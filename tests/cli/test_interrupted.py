@@ -13,10 +13,8 @@ import pytest
 
 import gvo
 from gvo.cli.terminal import Work
-from gvo.frontend.klt import KltFrontend
 from gvo.io.bag.reader import BagMessage
 from gvo.runs.smooth import Smoother
-from gvo.trajectory import evaluation
 from gvo.viz import plots
 from gvo.viz.report import run as report
 from tests.conftest import Command, interrupt_at_call, line_of_poses
@@ -134,24 +132,6 @@ def test_a_signal_while_a_graph_is_optimized_leaves_the_best_poses(
     assert graph.error(ends[0]) < graph.error(ends[1]) < min(starts.values())
     for name in ("raw", "smoothed"):
         assert len(gvo.read_trajectory(out / f"{name}.txt")) == 27
-
-
-def test_a_signal_while_trajectories_are_compared_ends_in_one_line(
-    command: Command, interrupt: Interrupt, tmp_path: Path
-) -> None:
-    poses = line_of_poses(tmp_path / "poses.txt")
-    interrupt(evaluation, "relative_errors", 1)
-    assert command("compare", poses, poses) == (143, "", f"gvo: interrupted; {ANEW}\n")
-
-
-def test_a_signal_while_the_demo_runs_ends_in_one_line(
-    command: Command, interrupt: Interrupt, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr("gvo.runs.demo.N_FRAMES", 3)
-    interrupt(KltFrontend, "extract", 1)
-    answer = command("demo", "--out", tmp_path)
-    assert answer.code == 143
-    assert answer.err == f"gvo: interrupted; what is done is in {tmp_path}; {ANEW}\n"
 
 
 def test_a_second_signal_interrupts_work_that_the_first_one_did_not_end(

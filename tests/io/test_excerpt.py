@@ -1,6 +1,6 @@
 """Parts of recordings."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -33,15 +33,10 @@ def _item(stamp_ns: int, *, is_pair: bool = True) -> Pair | FaultyFrame:
     return FaultyFrame(stamp_ns=stamp_ns, reason="no depth", is_unpaired=True)
 
 
-def _items(seconds: Iterable[float]) -> list[Pair | FaultyFrame]:
-    return [_item(_FIRST_NS + round(second * _SECOND)) for second in seconds]
-
-
 def _stamp_ns(item: Pair | FaultyFrame) -> int:
     return item.stamp_ns if isinstance(item, FaultyFrame) else item[0].stamp_ns
 
 
-_TENTHS = [n / 10 for n in range(50)]
 _recordings = st.lists(st.tuples(st.integers(1, 300), st.booleans()), min_size=1, max_size=40).map(
     lambda steps: [
         _item(_FIRST_NS + 10_000_000 * int(since), is_pair=is_pair)
@@ -109,13 +104,6 @@ def test_reading_ends_when_both_streams_are_past_the_end(lag: int) -> None:
     pairs = pair_images(images(), limit_ns=20_000_000, partner="depth")
     assert len(list(take_excerpt(pairs, Excerpt(start_s=20, duration_s=10)))) == 10
     assert n_read == 31 + lag
-
-
-def test_an_excerpt_after_the_end_tells_how_long_the_recording_is() -> None:
-    with pytest.raises(RecordingError, match=r"no frame at 60 s or later: .* is 4\.9 s long"):
-        list(take_excerpt(_items(_TENTHS), Excerpt(start_s=60)))
-    with pytest.raises(RecordingError, match=r"no frame at 5 s or later: .* is 4\.9 s long"):
-        list(take_excerpt(_items(_TENTHS), Excerpt(start_s=5, duration_s=10)))
 
 
 @pytest.mark.parametrize(

@@ -76,26 +76,6 @@ def test_each_fault_is_one_faulty_frame_and_the_others_are_read(tiny: Any, threa
     assert [item.stamp_ns for item in read if isinstance(item, StereoFrame)] == [10, 60, 70]
 
 
-def test_depth_of_which_nothing_is_known_is_faulty(tiny: Any) -> None:
-    unknown = np.full_like(tiny.depth(1), np.nan)
-    (frame,) = _read(tiny.rgbd([(0, 1, tiny.texture(1)), (1, 1, unknown)]))
-    assert isinstance(frame, FaultyFrame)
-    assert frame.reason == "depth image: no pixel of the depth image is known"
-    unknown[21, 7] = 1.5
-    (frame,) = _read(tiny.rgbd([(0, 1, tiny.texture(1)), (1, 1, unknown)]))
-    assert isinstance(frame, RgbdFrame)
-
-
-def test_the_tolerances_are_those_of_the_configuration(tiny: Any) -> None:
-    ms = 1_000_000
-    stereo = tiny.stereo([(0, 0, tiny.texture(1)), (1, ms, tiny.texture(2))])
-    assert isinstance(_read(stereo)[0], FaultyFrame)
-    assert isinstance(_read(stereo, stereo_tolerance_ms=1.0)[0], StereoFrame)
-    rgbd = tiny.rgbd([(0, 0, tiny.texture(1)), (1, 20 * ms, tiny.depth(2))])
-    assert isinstance(_read(rgbd)[0], RgbdFrame)
-    assert isinstance(_read(rgbd, max_difference_ms=19.9)[0], FaultyFrame)
-
-
 def _written(path: Path, tiny: Any, **changes: Any) -> Path:
     D = {"distortion_coefficients": {"data": [-0.2, 0.05, 0.001, -0.001, 0.0]}}
     path.write_text(json.dumps(tiny.ros_camera(**(D | changes))))

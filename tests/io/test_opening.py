@@ -5,11 +5,10 @@ from typing import Any
 
 import pytest
 
-from gvo.config import Config, DepthConfig
 from gvo.errors import CalibrationError, RecordingError
 from gvo.io.datasets.kitti import KittiSource
 from gvo.io.datasets.tum import TumSource
-from gvo.io.opening import RecordingOptions, is_bag, open_recording
+from gvo.io.opening import is_bag, open_recording
 
 
 def test_a_missing_path_is_refused_with_what_a_recording_may_be(tmp_path: Path) -> None:
@@ -47,20 +46,3 @@ def test_compressed_files_of_ros2_are_bags_with_and_without_metadata(tmp_path: P
     file.touch()
     assert is_bag(file)
     assert is_bag(tmp_path)
-
-
-def test_options_and_configuration_reach_the_source(tmp_path: Path, tiny: Any) -> None:
-    folder = tiny.write_tum(tmp_path / "b", ["1"], ["1"])
-    config = Config(depth=DepthConfig(scale=1234.0))
-    decisions = open_recording(folder, config=config).info.decisions
-    assert "depth: 1234 counts per metre, by depth.scale" in decisions
-    with pytest.raises(CalibrationError, match=r"none\.yaml"):
-        open_recording(folder, options=RecordingOptions(calibration=tmp_path / "none.yaml"))
-
-
-@pytest.mark.parametrize("name", ["left", "right", "color", "depth"])
-def test_topics_of_a_folder_are_refused(tmp_path: Path, tiny: Any, name: str) -> None:
-    folder = tiny.write_kitti(tmp_path / "a")
-    topics: dict[str, Any] = {name: "/topic"}
-    with pytest.raises(RecordingError, match=f"--{name} chooses a topic of a bag"):
-        open_recording(folder, options=RecordingOptions(**topics))

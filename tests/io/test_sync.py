@@ -136,26 +136,6 @@ def test_known_pairs_are_found(
     assert pairs == [(first[n], second[k]) for n, k in places]
 
 
-@pytest.mark.parametrize("limit_ns", [0, _LIMIT])
-def test_one_stream_may_run_ahead_as_far_as_the_queue_reaches(limit_ns: int) -> None:
-    stamps = list(range(0, 1000 * _QUEUE, 1000))
-    pairs = [(stamp, stamp) for stamp in stamps]
-    assert _pair(stamps, stamps, [False] * _QUEUE, limit_ns=limit_ns) == pairs
-    lost, *found = _pair([-1000, *stamps], stamps, [False] * (_QUEUE + 1), limit_ns=limit_ns)
-    assert str(lost).endswith("there is none, and 100 images wait already")
-    assert found == pairs
-
-
-def test_an_image_that_follows_a_given_up_one_is_no_pivot() -> None:
-    """The partner of depth 95 might have been the image at 96 that had to go."""
-    images = [_image(0, stamp) for stamp in (96, 100, 200)]
-    images += [_image(1, 95), _image(1, 201)]
-    answers = list(pair_images(images, limit_ns=20, partner="depth", queue_size=2))
-    assert isinstance(answers[0], FaultyFrame)
-    assert isinstance(answers[1], FaultyFrame)
-    assert isinstance(answers[2], tuple)
-
-
 @given(first=_stamps, second=_stamps, order=_order, limit_ns=st.sampled_from([0, _LIMIT]))
 def test_every_image_of_the_first_stream_is_answered_once(
     first: list[int], second: list[int], order: list[bool], limit_ns: int

@@ -8,18 +8,9 @@ from hypothesis import strategies as st
 from gvo.geometry import se3
 from gvo.trajectory.evaluation import Consistency
 from gvo.trajectory.trajectory import Trajectory
-from gvo.viz.figures import broken, draw_curve, evenly, gaps_before, new_figure, style
-from gvo.viz.palette import Style
+from gvo.viz.figures import broken, gaps_before, style
 from gvo.viz.report.paths import lines_of
 from gvo.viz.report.plots import covariance_plot
-
-
-def test_a_lone_point_between_gaps_is_drawn() -> None:
-    axes = new_figure(3.0).subplots()
-    y = np.array([1.0, np.nan, 2.0, np.nan, 3.0, 3.0])
-    draw_curve(axes, np.arange(6.0), y, Style(color="black"))
-    assert [np.asarray(line.get_xdata()).tolist() for line in axes.lines[1:]] == [[0.0, 2.0]]
-    assert axes.lines[1].get_marker() == "."
 
 
 @given(st.integers(2, 50), st.integers(1, 49))
@@ -31,14 +22,6 @@ def test_a_line_is_broken_where_a_step_is_long(n: int, at: int) -> None:
     if n > 3:  # of fewer poses, the long step is among the usual ones
         assert gaps_before(seconds).tolist() == [at]
         assert np.flatnonzero(np.isnan(points[:, 0])).tolist() == [at]
-
-
-@given(st.integers(1, 10_000), st.integers(2, 500))
-def test_what_is_thinned_keeps_both_ends(n: int, n_most: int) -> None:
-    chosen = evenly(n, n_most)
-    assert len(chosen) == min(n, n_most)
-    assert (chosen[0], chosen[-1]) == (0, n - 1)
-    assert np.all(np.diff(chosen) > 0)
 
 
 @pytest.mark.parametrize(("n", "n_gaps"), [(0, 0), (1, 0), (2, 0), (100_000, 1)])

@@ -2,15 +2,12 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy.stats import chi2
 
 from gvo.geometry import se3
-from gvo.trajectory.evaluation import KITTI_SEGMENTS_M, chi2_bound, evaluate
+from gvo.trajectory.evaluation import evaluate
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
-from gvo.viz.measures import chi2_density, compare, drift, drift_lengths
+from gvo.viz.measures import compare, drift
 from tests.trajectory.paths import circle
 
 COVARIANCE = np.diag([1e-4, 4e-4, 1e-4, 1e-2, 1e-2, 9e-2])
@@ -50,24 +47,3 @@ def test_rotation_errors_are_of_the_rotation_since_the_first_pose() -> None:
     ).errors_rad
     assert errors is not None
     np.testing.assert_allclose(errors, [0.0] * 25 + [0.1] * 25, atol=1e-6)
-
-
-@given(st.floats(0.1, 800.0))
-def test_segments_suit_the_path_in_round_numbers(path_m: float) -> None:
-    lengths = drift_lengths(path_m)
-    assert 4 <= len(lengths) <= 12
-    assert 0.4 * path_m < lengths[-1] <= 0.8 * path_m * (1 + 1e-9)
-    np.testing.assert_allclose(np.diff(lengths), lengths[0], rtol=1e-6)
-    assert all(len(f"{length:.10g}".replace(".", "").strip("0")) <= 3 for length in lengths)
-
-
-def test_long_paths_take_the_standard_segments_and_no_path_none() -> None:
-    assert drift_lengths(1200.0) == KITTI_SEGMENTS_M
-    assert drift_lengths(0.01) == ()
-
-
-def test_chi_square_agrees_with_scipy() -> None:
-    for share in (0.025, 0.5, 0.95, 0.975):
-        assert chi2_bound(share) == pytest.approx(chi2.ppf(share, 6))
-    values = np.linspace(0.0, 40.0, 100)
-    np.testing.assert_allclose(chi2_density(values), chi2.pdf(values, 6), atol=1e-12)

@@ -18,9 +18,7 @@ from gvo.viz.overlay import (
     compose_faulty,
     compose_overlay,
     draw_matches,
-    shortened,
     table,
-    text_width,
 )
 from gvo.viz.scene import loop_text
 from tests.make.results import estimate_at, loop_of, result_of
@@ -78,14 +76,6 @@ def test_matches_without_a_place_are_left_out_and_far_ones_do_no_harm() -> None:
     before = _GREY.copy()
     np.testing.assert_array_equal(_draw([sound, *broken, *far]), _draw([sound]))
     np.testing.assert_array_equal(_GREY, before)
-
-
-def test_a_coloured_image_and_unequal_counts_are_refused() -> None:
-    pixels, inliers = np.zeros((2, 2)), np.zeros(2, dtype=np.bool_)
-    with pytest.raises(ValueError, match="grey image and 2 matches"):
-        draw_matches(_plain(), pixels, pixels, inliers)
-    with pytest.raises(ValueError, match="grey image and 2 matches"):
-        draw_matches(_GREY, pixels, pixels[:1], inliers)
 
 
 _STEREO = StereoCamera(fx=600, fy=600, cx=320, cy=120, width=640, height=240, baseline=0.5)
@@ -172,19 +162,6 @@ def test_depth_has_the_colours_of_the_bar_and_what_is_unknown_is_dark() -> None:
     np.testing.assert_array_equal(panel[60, 600], (255, 255, 255))
 
 
-@given(
-    near=st.floats(0.05, 10.0), factor=st.floats(2.0, 500.0), depths=st.lists(st.floats(1e-3, 1e4))
-)
-def test_nearer_is_never_darker(near: float, factor: float, depths: list[float]) -> None:
-    scale = DepthScale(near_m=near, far_m=near * factor)
-    ordered = np.sort(np.array([*depths, near, near * factor]))
-    levels = scale.levels(ordered).astype(int)
-    assert (np.diff(levels) <= 0).all()
-    assert (levels[ordered <= near] == 255).all()
-    assert (levels[ordered >= near * factor] == 0).all()
-    assert np.ptp(table().astype(int).sum(axis=1)[[0, -1]]) > 100
-
-
 def test_a_loop_has_its_mark_in_the_upper_right_corner_and_leaves_the_stamp_readable() -> None:
     loop = loop_of(10**18, 10**18 - 98_765_400_000_000)
     plain = _result([], [], status=Status.RESUMED)
@@ -199,22 +176,3 @@ def test_a_loop_has_its_mark_in_the_upper_right_corner_and_leaves_the_stamp_read
     assert rows.max() < 24
     assert columns.max() >= 620
     assert not before[:24, columns.min() - 4 :].any()
-
-
-def test_images_of_another_size_and_a_pair_without_a_baseline_are_refused() -> None:
-    with pytest.raises(ValueError, match="expected images of 640x480"):
-        compose_overlay(_pair(), _result([], []), _RGBD)
-    flat = PinholeCamera(fx=500, fy=500, cx=320, cy=120, width=640, height=240)
-    with pytest.raises(ValueError, match="baseline"):
-        compose_overlay(_pair(), _result([], []), flat)
-    with pytest.raises(ValueError, match="max_width must be at least 640"):
-        compose_overlay(_pair(), _result([], []), _STEREO, max_width=600)
-
-
-@pytest.mark.parametrize("n_pixels", [30, 100, 400])
-def test_a_shortened_text_fits_and_is_a_beginning(n_pixels: int) -> None:
-    text = "image_0/000001.png: truncated \N{GREEK SMALL LETTER TAU}" * 2
-    short = shortened(text, n_pixels)
-    assert text_width(short) <= n_pixels
-    assert text.startswith(short.removesuffix("..."))
-    assert shortened(short, n_pixels) == short

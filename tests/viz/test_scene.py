@@ -15,9 +15,7 @@ from gvo.viz.scene import (
     History,
     Track,
     ellipsoids,
-    grey_values,
     matched_points,
-    position_sigmas,
     scene,
 )
 from tests.make.results import estimate_at, loop_of
@@ -131,12 +129,6 @@ def test_points_that_are_not_finite_are_left_out_and_pixels_may_be_unknown() -> 
     assert len(matched_points(result_of(0, registration=None)).points_cam) == 0
 
 
-def test_grey_values_are_those_of_the_nearest_pixels() -> None:
-    image = np.arange(12, dtype=np.uint8).reshape(3, 4)
-    pixels = np.array([[0.4, 0.0], [2.6, 1.2], [-0.6, 0.0], [0.0, 3.0], [np.nan, 1.0]])
-    np.testing.assert_array_equal(grey_values(image, pixels), [0, 7, 0, 0, 0])
-
-
 def estimate_of(seed: int, scale: float = 1.0) -> Estimate:
     """A pose, and a covariance (6, 6) with correlations."""
     rng = np.random.default_rng(seed)
@@ -166,11 +158,3 @@ def test_a_covariance_that_is_not_finite_has_no_ellipsoid(n_known: int) -> None:
     unknown = estimate_at(1, covariance=np.full((6, 6), np.inf))
     found = ellipsoids([unknown, *[estimate_of(1)] * n_known], 3.0)
     assert [len(each) for each in found] == [n_known] * 3
-
-
-def test_sigmas_are_those_of_drawn_poses() -> None:
-    estimate = estimate_of(4, 1e-4)
-    rng = np.random.default_rng(0)
-    xi = rng.multivariate_normal(np.zeros(6), estimate.covariance, size=20_000)
-    drawn = (estimate.T_world_frame @ se3.exp(xi))[:, :3, 3].std(axis=0)
-    np.testing.assert_allclose(position_sigmas(estimate), drawn, rtol=0.05)

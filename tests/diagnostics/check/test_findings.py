@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -84,25 +83,3 @@ def test_warnings_alone_do_not_make_a_recording_unusable() -> None:
     result = CheckResult(recording="r", findings=(warning, fault, warning))
     assert not result.is_healthy
     assert format_check(result).endswith("\nr: 1 fault, 2 warnings\n")
-
-
-@pytest.mark.parametrize(
-    ("second", "n_rows"),
-    [
-        ({"name": "right: rows", "value": "4"}, 1),
-        ({"name": "right: rows", "verdict": "warning", "fix": "do"}, 2),
-        ({"name": "right: columns"}, 2),
-    ],
-)
-def test_two_streams_share_a_line_where_both_are_well(second: dict[str, str], n_rows: int) -> None:
-    first = {"name": "left: rows", "value": "3", "threshold": "<= 5", "verdict": "ok"}
-    findings = (Finding(**first), Finding(**(first | second)))  # type: ignore[arg-type]
-    rows = format_check(CheckResult(recording="r", findings=findings)).splitlines()[1:-1]
-    assert len(rows) == n_rows
-    assert rows[0].startswith("left, right: rows" if n_rows == 1 else "left: rows")
-    assert ("3 | 4" in rows[0]) == ("value" in second)
-
-
-def test_line_ends_in_damaged_names_do_not_break_the_table() -> None:
-    finding = Finding(name="tf: a\nb", value="c\r\nd", fix="e\n")
-    assert (finding.name, finding.value, finding.fix) == ("tf: a b", "c d", "e")

@@ -14,7 +14,7 @@ from gvo.geometry import se3
 from gvo.geometry.camera import rectification_maps
 from gvo.io.bag.calibration import BagCalibration, calibrations_of_messages
 from gvo.io.bag.reader import BagReader
-from gvo.io.bag.topics import COMPRESSED_TYPE, IMAGE_TYPE, TopicChoice, choose_topics
+from gvo.io.bag.topics import COMPRESSED_TYPE, TopicChoice, choose_topics
 from gvo.io.calibration.camera_info import stereo_baseline
 from gvo.types import FloatArray
 from tests.make.bags import Message, camera_info, header, image, make, tf, write
@@ -108,18 +108,6 @@ def test_rectified_images_without_baseline_take_it_fromtf(tmp_path: Path) -> Non
         _found(tmp_path / "b.bag", messages)
 
 
-def test_without_any_baseline_the_message_says_what_was_looked_for(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match=r"nor from tf: .*right_optical.*--calibration FILE"):
-        _found(tmp_path / "a.bag", [*_pair(), _mounts()[0]])
-    messages = [m if m[1] == IMAGE_TYPE else camera_info(m[0], "same") for m in _pair()]
-    with pytest.raises(CalibrationError, match="both CameraInfo name the frame same"):
-        _found(tmp_path / "b.bag", messages)
-    messages = [m if m[1] == IMAGE_TYPE else camera_info(m[0], "") for m in _pair()]
-    with pytest.raises(CalibrationError, match="name no frame") as caught:
-        _found(tmp_path / "c.bag", messages)
-    assert str(caught.value).startswith("the bag: the baseline must be positive")
-
-
 @pytest.mark.parametrize("is_compressed", [False, True])
 def test_a_size_of_zero_is_that_of_the_image(tmp_path: Path, is_compressed: bool) -> None:
     messages = _pair(width=0, height=0)
@@ -164,14 +152,6 @@ def test_depth_of_another_camera_comes_with_its_calibration_and_place(tmp_path: 
     assert "0.0152 m from colour by tf color_optical -> depth_optical" in line
 
 
-def test_depth_of_one_frame_and_other_intrinsics_needs_notf(tmp_path: Path) -> None:
-    depths: list[dict[str, Any]] = [{"K": _DEPTH_K}, {"width": 64}]
-    for n, changes in enumerate(depths):
-        view = _found(tmp_path / f"{n}.bag", _rgbd(frame_id="color_optical", **changes)).depth_view
-        assert view is not None
-        np.testing.assert_array_equal(view.T_color_depth, np.eye(4))
-
-
 @pytest.mark.parametrize(
     ("name", "depth"),
     [
@@ -190,18 +170,6 @@ def test_registered_depth_is_left_alone(tmp_path: Path, name: str, depth: dict[s
     found = _found(tmp_path / "a.bag", [*_rgbd(name, **depth), *mounts])
     assert found.depth_view is None
     assert not any(line.startswith("depth: ") for line in found.decisions)
-
-
-def test_without_tf_the_advice_is_one_line(tmp_path: Path) -> None:
-    found = _found(tmp_path / "a.bag", _rgbd(K=_DEPTH_K))
-    assert found.depth_view is None
-    (line,) = [line for line in found.decisions if line.startswith("depth: ")]
-    assert "not registered to colour (fx 40.0 against 50.0 px; " in line
-    assert line.endswith("give a topic of depth registered to colour by --depth")
-    (line,) = _found(tmp_path / "b.bag", _rgbd()).decisions[1:]
-    assert "taken as registered" in line
-    found = _found(tmp_path / "c.bag", _rgbd("/c/unregistered_depth/image_raw", K=_DEPTH_K))
-    assert "not registered to colour" in found.decisions[-1]
 
 
 @pytest.mark.recorded

@@ -88,16 +88,6 @@ def test_stamps_that_go_back_are_skipped_and_counted(tmp_path: Path) -> None:
     assert warning.startswith("2 poses have a stamp that does not advance")
 
 
-def test_the_only_topic_is_taken_and_of_several_one_must_be_chosen(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.bag", {"/a": STAMPED, "/b": ODOMETRY})
-    with pytest.raises(RecordingError, match=r"--topic NAME.*/a .*/b "):
-        read(path)
-    names = [stream.name for stream in read_streams(path, ["b", "/a"], InputFaults())]
-    assert names == ["/b", "/a"]
-    with pytest.raises(RecordingError, match=r"no poses on topic /c.*/a .*/b "):
-        read(path, "/c")
-
-
 @pytest.mark.recorded
 def test_recorded_streams_are_read(gvo_data: Path) -> None:
     odometry, _ = read(gvo_data / "bags/good/nav2_turtlebot.mcap", "/odom")

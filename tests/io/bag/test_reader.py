@@ -134,15 +134,6 @@ def test_a_file_of_a_folder_that_is_empty_is_told(tmp_path: Path) -> None:
         BagReader(folder)
 
 
-def test_a_compressed_file_that_is_cut_is_told_by_its_own_name(tmp_path: Path) -> None:
-    folder = _split(tmp_path / "bag", ".mcap", "FILE")
-    path = folder / "part_2.mcap.zstd"
-    path.write_bytes(path.read_bytes()[:-20])
-    reader = BagReader(folder)
-    assert len(list(reader.messages(["/a"]))) >= 2 * _N
-    assert reader.damage.startswith(f"{path}: is cut or damaged (its end is missing)")
-
-
 def test_a_file_that_the_metadata_do_not_name_is_left_out(tmp_path: Path) -> None:
     folder = _split(tmp_path / "bag", ".mcap")
     (folder / "stray.mcap").write_bytes((folder / "part_0.mcap").read_bytes())

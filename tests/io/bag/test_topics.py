@@ -116,19 +116,6 @@ def test_no_camera_is_refused_with_what_there_is() -> None:
 
 
 @pytest.mark.parametrize(
-    "names",
-    [
-        ["/raspicam/image"],
-        ["/usb_cam/image_raw", "/usb_cam/image_raw/compressed", "/usb_cam/image_rect_color"],
-    ],
-)
-def test_one_camera_is_too_few_whatever_is_chosen(names: list[str]) -> None:
-    with pytest.raises(RecordingError, match=r"one camera alone.*needs a stereo pair") as caught:
-        _choose(_topics(*names))
-    assert "--left" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
     ("name", "is_rectified"),
     [
         ("/left/image_rect", True),

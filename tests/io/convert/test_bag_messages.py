@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from gvo.errors import RecordingError
 from gvo.io.convert.convert import convert
 from gvo.io.opening import open_recording
 from tests.io.conftest import Item, Tiny
@@ -66,12 +65,3 @@ def test_depth_comes_back_whatever_later_images_hold(tiny: Tiny, tmp_path: Path,
     # As the transport has it: 12 bytes before the PNG.
     png = cv2.imdecode(messages[0].data[12:], cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(png, np.round(1000 * np.nan_to_num(millimetres)))
-
-
-@_NAMES
-def test_depth_not_of_millimetres_stays_as_it_is(tiny: Tiny, tmp_path: Path, name: str) -> None:
-    fault = RecordingError("depth.png: damaged")
-    items: list[Item] = [(0, 1, tiny.texture(0)), (1, 1, fault), (0, 2, tiny.texture(1))]
-    convert(tiny.rgbd([*items, (1, 2, tiny.depth(0))]), tmp_path / name, compress=True)
-    (message,) = _messages(tmp_path / name, "/camera/depth/image")
-    assert message.encoding == "32FC1"

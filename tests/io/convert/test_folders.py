@@ -339,15 +339,6 @@ def test_without_an_image_nothing_is_left_behind(tiny: Tiny, tmp_path: Path, tar
     assert list(tmp_path.iterdir()) == []
 
 
-def test_images_that_are_left_out_are_counted_not_listed(tiny: Tiny, tmp_path: Path) -> None:
-    lonely: list[Item] = [(0, _START_NS + 10**9 + n, tiny.texture(n)) for n in range(40)]
-    written = write_folder(tiny.stereo([*_pairs(tiny), *lonely]), tmp_path / "a", layout="kitti")
-    (line,) = written.skipped
-    assert line.startswith(f"40 left images were left out; the first: at {_START_NS + 10**9} ns: ")
-    assert "no right image within sync.stereo_tolerance_ms" in line
-    assert sum(1 for _ in open_recording(tmp_path / "a").images()) == 6
-
-
 @pytest.mark.parametrize("layout", ["euroc", "tum"])
 def test_images_that_do_not_advance_are_out(tiny: Tiny, tmp_path: Path, layout: Layout) -> None:
     source = _source_for(tiny, layout)
@@ -378,9 +369,3 @@ def test_an_unreadable_image_of_kitti_leaves_its_number_free(tiny: Tiny, tmp_pat
         items[0][1],
         items[4][1],
     ]
-
-
-def test_a_tum_folder_is_not_given_the_name_of_another_camera(tiny: Tiny, tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"my_freiburg2_walk: .* give another name"):
-        write_folder(tiny.rgbd(_rgbd_items(tiny)), tmp_path / "my_freiburg2_walk")
-    assert list(tmp_path.iterdir()) == []

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from gvo.errors import CalibrationError, RecordingError
+from gvo.errors import RecordingError
 from gvo.io.datasets.euroc import EurocSource
 
 _STAMPS = (1403636584763555584, 1403636584813555456)
@@ -59,14 +59,6 @@ def test_the_truth_is_that_of_the_rectified_left_camera(tmp_path: Path, tiny: An
     found = truth.T_world_frame[0] @ np.append(point_rectified, 1.0)
     np.testing.assert_allclose(found[:3], expected, atol=1e-12)
     assert truth.stamps_ns.tolist() == [_STAMPS[0]]
-
-
-def test_a_missing_sensor_says_the_way_out(tmp_path: Path, tiny: Any) -> None:
-    folder = _write(tmp_path / "m", tiny)
-    (folder / "mav0/cam1/sensor.yaml").unlink()
-    said = r"cam1/sensor\.yaml: does not exist; add it or give --calibration FILE"
-    with pytest.raises(CalibrationError, match=said):
-        EurocSource(folder)
 
 
 def test_a_missing_table_is_refused_and_a_missing_image_is_not(tmp_path: Path, tiny: Any) -> None:

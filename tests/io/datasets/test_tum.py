@@ -9,7 +9,6 @@ import pytest
 import yaml
 
 from gvo.config import Config, DepthConfig
-from gvo.errors import CalibrationError
 from gvo.io.datasets.tum import TumSource
 from gvo.io.frames import frames
 from gvo.types import RgbdFrame
@@ -69,13 +68,6 @@ def test_the_file_given_wins_then_the_name_then_the_file_beside(tmp_path: Path, 
     info = TumSource(folder, calibration=path).info
     assert info.camera.fx == 99.0
     assert "calibration: mine.yaml" in info.decisions
-
-
-def test_without_any_calibration_the_message_says_what_to_give(tmp_path: Path, tiny: Any) -> None:
-    folder = tiny.write_tum(tmp_path / "office", _COLOR, _DEPTH)
-    (folder / "calibration.yaml").unlink()
-    with pytest.raises(CalibrationError, match="--calibration FILE"):
-        TumSource(folder)
 
 
 def test_the_scale_is_the_users_then_the_files_then_5000(tmp_path: Path, tiny: Any) -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from gvo.geometry import se3
-from gvo.io.edges.lines import Request, format_error, format_estimate, parse_line, read_lines
+from gvo.io.edges.lines import Request, format_estimate, parse_line, read_lines
 from gvo.io.edges.pose_streams import StepSigma
 from gvo.types import Edge, Estimate, PosePrior, PositionPrior, Rejected, Status
 
@@ -69,10 +69,6 @@ def test_a_prior_is_a_pose_or_a_position_in_the_world() -> None:
     assert position.covariance[0, 1] == position.covariance[1, 0] == 0.5
 
 
-def test_keyframes_are_kept_and_released() -> None:
-    assert [parsed(keep=keep).keep for keep in (True, False, None)] == [True, False, None]
-
-
 def test_json_may_hold_several_edges_and_a_prior() -> None:
     edge = {"reference": 1, "pose": [0, 0, 1, 0, 0, 0, 1]}
     prior = {"position": [1, 2, 3]}
@@ -127,11 +123,6 @@ def test_answers_hold_the_estimate_without_loss(seed: int) -> None:
     np.testing.assert_array_equal(by_json["covariance"], covariance[UPPER])
     sign = np.sign(np.dot(by_json["pose"][3:], pose[3:]))
     np.testing.assert_allclose(by_json["pose"][3:], sign * np.array(pose[3:]), atol=1e-12)
-
-
-def test_errors_are_json_in_one_line() -> None:
-    assert json.loads(format_error("line 3:\nno")) == {"error": "line 3:\nno"}
-    assert "\n" not in format_error("line 3:\nno")
 
 
 def test_lines_come_as_they_are_written_also_without_a_last_line_end() -> None:

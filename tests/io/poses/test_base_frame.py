@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from gvo.errors import ConfigurationError, RecordingError
 from gvo.geometry import se3
@@ -194,17 +193,6 @@ def test_true_poses_of_the_camera_become_those_of_the_frame_in_its_world(is_movi
     for n, T_world_base in enumerate(truth.T_world_frame):
         T = T_base_cam[n] if is_moving else T_base_cam[0]
         np.testing.assert_allclose(T_world_base @ T, drive[n + first].T_world_frame, atol=1e-9)
-
-
-def test_the_initial_pose_is_read_with_and_without_a_rotation() -> None:
-    assert parse_initial_pose("truth") == "truth"
-    np.testing.assert_array_equal(
-        parse_initial_pose("1, -2,3e1"), se3.make_transform(np.eye(3), np.array([1.0, -2.0, 30.0]))
-    )
-    half = np.sqrt(0.5)
-    T = parse_initial_pose(f"0,0,0,0,0,{half:.4f},{half:.4f}")
-    expected = Rotation.from_euler("z", 90, degrees=True).as_matrix()
-    np.testing.assert_allclose(np.asarray(T)[:3, :3], expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -116,19 +116,6 @@ def test_a_run_of_the_base_is_brought_to_the_camera_of_the_truth(
         np.testing.assert_allclose(estimate.T_world_frame, truth.T_world_frame, atol=1e-8)
 
 
-def test_a_run_of_the_camera_stays_as_it_is(of_camera: Path, tmp_path: Path) -> None:
-    bag = PoseBag(tmp_path / "plain.bag")
-    for n, T in enumerate(MOTION @ T_BASE_CAM):
-        bag.pose("/odom", ODOMETRY, n * 10**8, T, child="gvo/causal/cam")
-        bag.pose("/pose", STAMPED, n * 10**8, T)
-    path = bag.write()
-    texts = [f"{path}#/odom", f"{path}#/pose", *([str(of_camera)] * of_camera.is_file())]
-    truth, estimates, warnings = read_compared(str(of_camera), texts)
-    assert warnings == []
-    for estimate in estimates.values():
-        np.testing.assert_allclose(estimate.T_world_frame, truth.T_world_frame, atol=1e-9)
-
-
 def test_what_is_not_of_the_camera_of_the_truth_is_compared_with_a_warning(
     of_camera: Path, bag: Path
 ) -> None:
@@ -161,22 +148,3 @@ def test_a_bag_that_names_no_truth_lists_what_can_be_asked_for(tmp_path: Path) -
     path = camera_bags.write(tmp_path / "d.bag", [camera_bags.camera_info("/info")])
     with pytest.raises(RecordingError, match=r"d.bag: holds no poses: neither tf nor"):
         read_poses(str(path))
-
-
-def test_files_are_read_and_win_over_bags(bag: Path, tmp_path: Path) -> None:
-    trajectory = Trajectory(stamps_ns=np.arange(8), T_world_frame=MOTION)
-    for name in ("poses.txt", f"{bag.name}#odd"):
-        write_tum(tmp_path / name, trajectory)
-        assert read_poses(str(tmp_path / name)).stamps_ns.tolist() == list(range(8))
-
-
-def test_a_folder_of_ros2_is_a_bag(tmp_path: Path) -> None:
-    bag = PoseBag(tmp_path / "c.mcap")
-    bag.pose("/odom", ODOMETRY, 3, np.eye(4))
-    folder = bag.write().parent
-    assert read_poses(f"{folder}#/odom").stamps_ns.tolist() == [3]
-    with pytest.raises(RecordingError, match="name the poses"):
-        read_poses(str(folder))
-    bag = PoseBag(tmp_path / "d.mcap")
-    bag.pose("/gt_pose", ODOMETRY, 4, np.eye(4))
-    assert read_poses(str(bag.write().parent)).stamps_ns.tolist() == [4]

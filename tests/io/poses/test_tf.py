@@ -170,13 +170,6 @@ def test_nothing_is_extrapolated_and_the_answer_names_the_known_range() -> None:
     assert x_of(buffer, "a", "c", 2.5) == 3.5
 
 
-def test_a_static_transform_holds_at_all_stamps() -> None:
-    buffer = TfBuffer()
-    add_transform(buffer, "a", "b", 10**18, shift(1.0), is_static=True)
-    add_transform(buffer, "a", "b", 10**18 - 1, shift(2.0), is_static=True)
-    assert x_of(buffer, "a", "b", 0.0) == x_of(buffer, "a", "b", 4e9) == 2.0
-
-
 def test_of_two_transforms_with_one_stamp_the_later_counts() -> None:
     buffer = moving(1.0, 2.0, 3.0)
     found(buffer.lookup("a", "b", 2 * 10**9))
@@ -184,15 +177,6 @@ def test_of_two_transforms_with_one_stamp_the_later_counts() -> None:
     assert x_of(buffer, "a", "b", 2.0) == 7.0
     assert x_of(buffer, "a", "b", 1.5) == 4.0
     assert buffer.edge_stamps_ns("a", "b").tolist() == [10**9, 2 * 10**9, 3 * 10**9]
-
-
-def test_an_unknown_frame_is_answered_with_the_nearest_names() -> None:
-    buffer = moving(1.0, child="base_link")
-    assert "base_lnk (the nearest: base_link)" in reason_of(buffer.lookup("a", "base_lnk", 0))
-    assert "it holds a, base_link" in reason_of(buffer.lookup("zzz", "a", 0))
-    assert "empty" in reason_of(TfBuffer().lookup("a", "b", 0))
-    assert not buffer.chain("a", "zzz")
-    assert len(buffer.edge_stamps_ns("a", "zzz")) == 0
 
 
 def test_frames_of_two_trees_are_answered_with_both_roots() -> None:

@@ -1,13 +1,12 @@
 """Truth and estimate in one frame: the same motion seen from two places of one body."""
 
 import numpy as np
-import pytest
 
 from gvo.geometry import se3
 from gvo.io.poses.tf import TfBuffer
 from gvo.io.poses.truth import Poses, Truth, in_frame
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Failure, FloatArray
+from gvo.types import FloatArray
 from tests.make.bags import add_transform
 
 SECOND = 10**9
@@ -56,25 +55,6 @@ def test_a_mount_from_a_file_goes_with_tf_up_to_the_camera() -> None:
     found = framed(truth, mounted(), base_frame="body", camera_frame="cam", T_base_cam=T_body_cam)
     expected = motion() @ T_BASE_CAM @ np.linalg.inv(T_body_cam)
     np.testing.assert_allclose(found.trajectory.T_world_frame, expected, atol=1e-9)
-
-
-def test_poses_that_name_no_frame_are_taken_for_the_one_asked_for() -> None:
-    truth = truth_of(trajectory(motion()), "")
-    for frame, name in (("base", "base"), ("", "the camera")):
-        found = framed(truth, TfBuffer(), base_frame=frame)
-        assert found.trajectory is truth.trajectory
-        assert found.decision.endswith(f"; it names no frame, taken for {name}")
-
-
-@pytest.mark.parametrize(
-    ("camera_frame", "reason"), [("cam", "tf holds no frame"), ("", "does not name: tf cannot")]
-)
-def test_poses_of_a_frame_out_of_reach_are_not_compared(camera_frame: str, reason: str) -> None:
-    truth = truth_of(trajectory(motion()), "vicon/drone")
-    found = in_frame(truth, TfBuffer(), camera_frame=camera_frame)
-    assert isinstance(found, Failure)
-    assert found.reason.startswith("its poses are of vicon/drone, those of the estimate of ")
-    assert reason in found.reason
 
 
 def test_where_the_mount_is_not_known_the_poses_are_left_out() -> None:

@@ -93,14 +93,6 @@ def test_a_folder_below_a_file_is_refused_before_anything_is_made(tmp_path: Path
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_a_folder_without_permission_is_refused_before_anything_is_made(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("os.access", lambda *_, **__: False)  # as of one who is not root
-    with pytest.raises(OutputError, match=f"no permission to write to {tmp_path}"):
-        check_unused(tmp_path / "a" / "out")
-
-
 def test_a_folder_is_named_after_the_recording_and_numbered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -133,32 +133,6 @@ def test_a_surface_is_not_seen_from_behind_unless_it_has_two_sides() -> None:
         assert np.any(np.isfinite(depth_of(scene, turned))) == is_two_sided
 
 
-def test_a_scene_without_anything_in_view_is_haze() -> None:
-    away = make_transform(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
-    assert np.all(image_of(scene_of(screen(2.0)), away) == 7.0)
-    assert np.all(np.isnan(depth_of(scene_of(screen(2.0)), away)))
-
-
-def test_texels_as_large_as_pixels_come_out_unchanged() -> None:
-    # 64 texels per metre at a depth of 2 m and fx = 128: one texel per pixel.
-    camera = PinholeCamera(fx=128.0, fy=128.0, cx=31.5, cy=31.5, width=64, height=64)
-    texture = noise_texture()
-    scene = scene_of(screen(2.0, half=0.5), t=texture)
-    image = image_of(scene, camera=camera)
-    np.testing.assert_array_equal(image, texture.pixels)
-
-
-@pytest.mark.parametrize("shift", [0.25, 0.5])
-def test_a_shift_by_parts_of_a_pixel_interpolates_between_texels(shift: float) -> None:
-    camera = PinholeCamera(fx=128.0, fy=128.0, cx=31.5 - shift, cy=31.5, width=64, height=64)
-    texture = noise_texture()
-    image = image_of(scene_of(screen(2.0, half=1.5), t=texture), camera=camera)
-    following = np.roll(texture.pixels, -1, axis=1)
-    expected = (1 - shift) * texture.pixels + shift * following.astype(float)
-    # The image shows the period from -0.5 m to 0.5 m, the screen starts one earlier.
-    np.testing.assert_allclose(image, expected, atol=0.51)
-
-
 @pytest.mark.parametrize("depth", [4.0, 15.0])
 def test_far_textures_are_averaged_not_sampled(depth: float) -> None:
     scene = scene_of(screen(depth, half=100.0), t=noise_texture())
@@ -194,26 +168,3 @@ def test_what_a_mask_leaves_out_shows_what_is_behind() -> None:
     center = round(CAMERA.cx)
     assert np.all(depth[20:28, center - 8 : center - 1] == 2.0)
     assert np.all(depth[20:28, center + 2 : center + 8] == 4.0)
-
-
-def test_haze_hides_what_is_far() -> None:
-    grey = texture_of(np.full((8, 8), 100))
-    light = Light(ambient=1.0, direct=0.0, haze_m=10.0, haze_grey=200.0)
-    for z in (1.0, 10.0, 50.0):
-        image = image_of(scene_of(screen(z, half=99.0), light=light, t=grey))
-        assert image[24, 31] == pytest.approx(200 - 100 * np.exp(-z / 10), abs=0.01)
-
-
-@pytest.mark.parametrize("edge_t", [(1.0, 1.0, 0.0), (0.0, 0.0, 0.0)])
-def test_a_rectangle_without_right_angles_is_refused(edge_t: tuple[float, float, float]) -> None:
-    with pytest.raises(ValueError, match="edges of a rectangle must"):
-        scene_of(Rectangle(corner=(0, 0, 2), edge_s=(1, 0, 0), edge_t=edge_t, texture="t"))
-
-
-def test_textures_of_sizes_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(ValueError, match="power of two"):
-        texture_of(np.zeros((12, 12)))
-    with pytest.raises(ValueError, match="mask"):
-        texture_of(np.zeros((8, 8)), mask=np.ones((4, 4), dtype=bool))
-    with pytest.raises(ValueError, match="one size"):
-        scene_of(screen(1.0), t=texture_of(np.zeros((8, 8))), s=texture_of(np.zeros((4, 4))))

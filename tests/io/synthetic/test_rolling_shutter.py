@@ -22,7 +22,6 @@ from gvo.io.synthetic.world import WORLDS
 from gvo.types import DepthArray, FloatArray
 
 CAMERA = PinholeCamera(fx=525.0, fy=520.0, cx=319.5, cy=239.5, width=640, height=480)
-SMALL = PinholeCamera(fx=131.0, fy=130.0, cx=79.5, cy=59.5, width=160, height=120)
 READOUT_S = 0.03
 
 
@@ -105,9 +104,3 @@ def test_each_row_is_that_of_an_image_taken_at_its_stamp(name: Any, sensor: Any)
             np.testing.assert_allclose(recording.render_depth(11, stream)[row], depth, rtol=1e-6)
         if sensor == "rgbd":
             np.testing.assert_allclose(loaded[1][row], depth, rtol=1e-5)
-
-
-@pytest.mark.parametrize("readout_ms", [-1.0, 34.0])
-def test_a_readout_that_no_frame_has_is_refused(readout_ms: float) -> None:
-    with pytest.raises(ValueError, match=r"readout_ms must be in \[0, 33.3\]"):
-        SyntheticRecording("handheld", readout_ms=readout_ms)

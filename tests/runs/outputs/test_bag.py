@@ -9,8 +9,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
@@ -195,43 +193,6 @@ def test_every_topic_comes_once_a_frame_stamped(bag: _Bag) -> None:
     assert sorted(_stamp_ns(message.header) for _, message in smoothed) == stamps
     for log_time_ns, message in smoothed:
         assert log_time_ns == known_ns.get(_stamp_ns(message.header), stamps[-1])
-
-
-def test_mcap_and_mcap_ros2_read_the_same_as_rosbags(bag: _Bag) -> None:
-    if bag.path.suffix == ".bag":
-        return
-    found = defaultdict(list)
-    with bag.path.open("rb") as file:
-        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
-        summary = reader.get_summary()
-        for _, channel, message, content in reader.iter_decoded_messages():
-            found[channel.topic].append((message.log_time, content))
-    assert summary is not None
-    assert summary.statistics is not None
-    assert summary.statistics.message_count == sum(map(len, bag.messages.values()))
-    assert found.keys() == bag.messages.keys()
-    for topic, items in bag.messages.items():
-        for (mine_ns, mine), (theirs_ns, theirs) in zip(found[topic], items, strict=True):
-            assert mine_ns == theirs_ns
-            _assert_equal(mine, theirs)
-
-
-def _assert_equal(mine: Any, theirs: Any) -> None:
-    """Compare two readers' messages field by field."""
-    if hasattr(theirs, "__dataclass_fields__"):
-        for field in theirs.__dataclass_fields__:
-            if not field.startswith("__") and hasattr(mine, field):
-                _assert_equal(getattr(mine, field), getattr(theirs, field))
-    elif isinstance(theirs, np.ndarray):
-        data = np.frombuffer(mine, np.uint8) if isinstance(mine, bytes | memoryview) else mine
-        np.testing.assert_array_equal(np.asarray(data), theirs)
-    elif isinstance(theirs, list):
-        for one, other in zip(mine, theirs, strict=True):
-            _assert_equal(one, other)
-    elif isinstance(mine, bytes):
-        assert mine == bytes([theirs])
-    else:
-        assert mine == theirs
 
 
 def test_tf_holds_the_poses_and_a_camera_hangs_on_each(bag: _Bag) -> None:

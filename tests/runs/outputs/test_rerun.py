@@ -3,7 +3,6 @@
 import csv
 import resource
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("rerun")
 import pyarrow as pa  # type: ignore[import-untyped]
-import rerun as rr
 from rerun.chunk import RrdReader
 
 from gvo.config import Config
@@ -313,22 +311,6 @@ def test_faulty_frames_are_told_and_counted(tmp_path: Path) -> None:
     assert [row[2] for row in rows][::2] == ["skipped: black", "skipped: torn"]
     assert [row.frame for row in read.rows["/world/causal/frame"]] == [1, 3]
     assert [(r.frame, r.stamp_ns) for r in read.rows["/world/smoothed/frame"]] == [(1, 2)]
-
-
-def test_a_file_has_its_name_when_it_is_closed_also_of_an_interrupted_run(tmp_path: Path) -> None:
-    path = tmp_path / "new" / "made.rrd"
-    with suppress(KeyboardInterrupt), RunRerun(path, _CAMERA) as file:
-        file.add_frame(_frame(0), _made(0))
-        assert not path.exists()
-        raise KeyboardInterrupt
-    size = path.stat().st_size
-    file.close()  # again: nothing
-    assert path.stat().st_size == size
-    assert list(path.parent.iterdir()) == [path]
-    read = _Read(path)
-    assert len(read.rows["/overlay"]) == 1
-    assert (read.application, read.n_blueprints) == ("gvo", 1)
-    assert rr.get_global_data_recording() is None
 
 
 @pytest.fixture
