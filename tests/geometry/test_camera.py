@@ -185,3 +185,12 @@ def test_each_difference_between_raw_and_rectified_is_mapped(what: str) -> None:
     np.testing.assert_allclose([u, v], np.asarray(pixel).ravel(), atol=1e-3)
     assert [m.dtype for m in maps] == [np.float32, np.float32]
     assert [m.shape for m in maps] == [(480, 640)] * 2
+
+
+def test_the_view_ends_at_the_centres_of_the_outer_pixels() -> None:
+    right, bottom = CAMERA.width - 1.0, CAMERA.height - 1.0
+    inside = np.array([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]])
+    assert CAMERA.is_in_view(inside).all()
+    for step in ([-0.1, 0.0], [0.0, -0.1]):
+        assert not CAMERA.is_in_view(inside[:1] + step).any()
+        assert not CAMERA.is_in_view(inside[3:] - step).any()

@@ -65,6 +65,7 @@ def test_the_order_of_joining_does_not_matter(seed: int) -> None:
 def test_an_edge_turned_twice_is_itself(seed: int) -> None:
     edge = edge_of(seed)
     twice = inverse(inverse(edge, "b"), "a")
+    assert (inverse(edge, "b").reference_id, twice.reference_id) == ("b", "a")
     np.testing.assert_allclose(twice.T_reference_frame, edge.T_reference_frame, atol=1e-12)
     np.testing.assert_allclose(twice.covariance, edge.covariance, rtol=1e-9, atol=1e-18)
 

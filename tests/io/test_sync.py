@@ -213,6 +213,8 @@ def test_an_image_without_a_partner_says_how_far_the_nearest_is(limit_ms: int) -
     answer, _ = _pair(stamps, [50 * ms, 133 * ms, 200 * ms], limit_ns=limit_ms * ms)
     assert answer == f"{100 * ms}: no depth={limit_ms}: the nearest is 33 ms away"
     assert "there is none" in str(_pair([100], [], limit_ns=limit_ms)[0])
+    taken, _ = _pair([100, 108], [10, 106])
+    assert str(taken).endswith("e-06 ms away and belongs to another image")
 
 
 @pytest.mark.parametrize("limit_ns", [0, _LIMIT])

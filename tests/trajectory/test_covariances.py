@@ -58,6 +58,9 @@ def test_covariances_are_told_by_chance_and_factor(stated: float) -> None:
     assert told["nees_low"] == pytest.approx(1.0 - 1.96 * np.sqrt(2 / 294), abs=0.01)
     assert told["nees_high"] == pytest.approx(1.0 + 1.96 * np.sqrt(2 / 294), abs=0.01)
     assert (told["motion"], told["n"]) == ("raw over 1 s", 490)
+    turns, shifts = (np.linalg.norm(found.errors[:, each], axis=1) for each in np.s_[:3, 3:])
+    assert told["error_deg"] == pytest.approx(np.rad2deg(np.sqrt(np.mean(turns**2))))
+    assert told["error_m"] == pytest.approx(np.sqrt(np.mean(shifts**2)))
     assert told["error_m"] == pytest.approx(np.sqrt(10 * 11e-4), rel=0.3)
 
 

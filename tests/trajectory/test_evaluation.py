@@ -104,6 +104,7 @@ def devkit_errors(
         (200, 0.5, [20.0, 50.0], 1, {}),
         (700, 2.0, [100.0 * k for k in range(1, 9)], 10, {}),
         (150, 1.0, [30.0], 7, {"segments": [30.0], "segment_step": 7}),
+        (40, 0.1, [0.5], 1, {"segments": [0.5]}),  # of a hand
     ],
 )
 def test_segment_errors_are_those_of_the_devkit(

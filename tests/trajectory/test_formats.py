@@ -15,6 +15,7 @@ from gvo.trajectory.formats import (
     format_tum_line,
     read_covariances,
     read_trajectory,
+    write_euroc,
     write_kitti,
     write_tum,
 )
@@ -40,6 +41,7 @@ def test_files_give_back_stamps_and_covariances_exactly_and_poses_to_nanometres(
     for write, stamps_from, expected_ns in (
         (write_tum, "file", trajectory.stamps_ns),
         (write_kitti, "rows", 10**9 * np.arange(8)),
+        (write_euroc, "file", trajectory.stamps_ns),
     ):
         write(folder / "00.txt", trajectory)
         back = read_trajectory(folder / "00.txt")
@@ -52,6 +54,8 @@ def test_files_give_back_stamps_and_covariances_exactly_and_poses_to_nanometres(
     np.testing.assert_array_equal(stamps_ns, trajectory.stamps_ns)
     np.testing.assert_array_equal(np.triu(covariances), np.triu(trajectory.covariances))
     np.testing.assert_array_equal(covariances, covariances.transpose(0, 2, 1))
+    with pytest.raises(TrajectoryError, match="expected the header stamp_ns,rx_rx"):
+        read_covariances(folder / "00.txt")
 
 
 def test_the_covariance_line_holds_the_upper_triangle_row_by_row() -> None:
