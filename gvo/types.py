@@ -607,28 +607,29 @@ class Optimum:
     Parameters
     ----------
     estimates : tuple of Estimate
-        Of all frames, by stamp, with marginal covariances where they were asked for.
-    keyframes_ns : tuple of int
+        Of all frames, by stamp, with marginal covariances; the smoothed ones where no loop counts.
+    frames_ns : tuple of int
         Stamps of those frames among them that the edges are between.
     edges : tuple of (int, Edge)
-        The stamp of a keyframe, and its pose in another one; without loops.
+        The stamp of a frame, and its pose in another one; without loops.
     loops : tuple of Loop
         All that were registered; those that do not count have a reason.
     residuals : ndarray of float64, shape (n,)
         Norms of the loops' whitened residuals, about 2.4 where the covariances are right.
-    error_before, error : float
-        Half the sum of the squared whitened residuals, of the poses along odometry and of these.
+    error_before, error : float or None
+        Half the sum of the squared whitened residuals, of the smoothed poses and of these; None
+        where no loop counts.
     n_iterations : int
     """
 
     estimates: tuple[Estimate, ...]
-    keyframes_ns: tuple[int, ...]
+    frames_ns: tuple[int, ...]
     edges: tuple[tuple[int, Edge], ...]
     loops: tuple[Loop, ...]
     residuals: FloatArray
-    error_before: float
-    error: float
-    n_iterations: int
+    error_before: float | None = None
+    error: float | None = None
+    n_iterations: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -373,6 +373,8 @@ class BatchOptimizer:
     robust : {"none", "huber", "gnc"}
         Least squares; Huber's kernel on each edge; or graduated non-convexity: edges other than
         those of odometry count fully or not at all.
+    start : {"best", "given"}
+        The best of the three starts; or the given poses, which are known to be near the optimum.
     on_step : callable
         Called with the state in words after each step; may raise to end the work.
 
@@ -399,6 +401,7 @@ class BatchOptimizer:
         graph: WholeGraph,
         robust: Robust = "none",
         *,
+        start: Literal["best", "given"] = "best",
         on_step: Callable[[str], None] = lambda _: None,
     ) -> None:
         self._on_step, self._is_graduated = on_step, robust == "gnc"
@@ -416,7 +419,7 @@ class BatchOptimizer:
         self.refused: list[Link] = []
         self.n_iterations, self.is_converged = 0, True
         self.starts: dict[str, float] = {}
-        self._choose_start(is_given=bool(graph.given))
+        self._choose_start(is_given=bool(graph.given), is_only=start == "given")
 
     def _split(self, graph: WholeGraph, trusted: Set[int]) -> None:
         """Make the factors of the graph; those that may be refused apart from the others."""
@@ -454,13 +457,14 @@ class BatchOptimizer:
         doubted = np.minimum(self._chi2(values), INLIER_CHI2).sum()
         return float(self._kept.error(values) + 0.5 * doubted)
 
-    def _choose_start(self, *, is_given: bool) -> None:
+    def _choose_start(self, *, is_given: bool, is_only: bool) -> None:
         starts = {"given": self.values} if is_given else {}
-        starts["odometry"] = self.raw
-        try:
-            starts["chordal"] = gtsam.InitializePose3.initialize(self._factors)
-        except RuntimeError:
-            _LOGGER.debug("no chordal relaxation")
+        if not is_only:
+            starts["odometry"] = self.raw
+            try:
+                starts["chordal"] = gtsam.InitializePose3.initialize(self._factors)
+            except RuntimeError:
+                _LOGGER.debug("no chordal relaxation")
         self.starts = {name: self._error_of(values) for name, values in starts.items()}
         self.start = min(self.starts, key=self.starts.__getitem__)
         self.values, self.error = starts[self.start], self.starts[self.start]

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
-from bisect import bisect_right
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import takewhile
-from typing import Any, Final
+from itertools import islice, takewhile
+from typing import Any
 
 import numpy as np
 
@@ -17,9 +15,9 @@ from gvo.frontend.features import PlaceIndex
 from gvo.frontend.protocol import Recognizer
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
-from gvo.odometry.graph import Table
+from gvo.odometry.graph import RunGraph
 from gvo.odometry.keyframes import view_overlap
-from gvo.types import FloatArray, Frame, Loop, RelativePose, SegmentJoin, Status
+from gvo.types import FloatArray, Frame, Loop, RelativePose
 
 # A frame that shows less than so much of the latest place is another one.
 _MAX_OVERLAP = 0.7
@@ -37,59 +35,20 @@ _N_WAITING = 5
 _N_BESIDE = 2
 _AGREEMENT = 5.0
 _DRIFT = 0.02
-# In a world that no loop connects with the others, so many frames search all of them; later ones
+# In a part that nothing connects with the first one, so many frames search all others; later ones
 # with growing pauses of at most so many frames.
 _N_EAGER = 15
 _MAX_PAUSE = 30
 _UNCONFIRMED = "no other loop confirms it"
 _AMBIGUOUS = "it fits several places"
 
-_LOOP: Final = np.dtype(
-    [
-        *(("stamp_ns", "i8"), ("reference_ns", "i8"), ("T_reference_frame", "f8", (4, 4))),
-        *(("covariance", "f8", (6, 6)), ("n_matches", "i8"), ("n_inliers", "i8")),
-        ("reason", f"U{len(_UNCONFIRMED)}"),
-    ]
-)
-"""A loop that nothing confirms any more."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Visit:
-    """A place, and where odometry was when it was seen, in one of its worlds."""
+    """A place, and where odometry was when it was seen."""
 
     place: Any
     T_world_frame: FloatArray
-    world: int
-
-
-class _Loops(Sequence[Loop]):
-    """Loops as they came: rows of a table, and the latest ones, which others may yet confirm.
-
-    A shallow copy stays as it is.
-    """
-
-    def __init__(self) -> None:
-        self._table, self._n_rows = Table(_LOOP), 0
-        self.latest: tuple[Loop, ...] = ()
-
-    def __len__(self) -> int:
-        return self._n_rows + len(self.latest)
-
-    def __getitem__(self, index: Any) -> Any:  # noqa: ANN401 - a loop, or some where it is a slice
-        if isinstance(index, slice):
-            return [self[k] for k in range(len(self))[index]]
-        index = range(len(self))[index]
-        if index >= self._n_rows:
-            return self.latest[index - self._n_rows]
-        return Loop(**self._table.fields(index))
-
-    def settle(self, before_ns: float = math.inf) -> None:
-        """Add those before a stamp to the table."""
-        settled = [loop for loop in self.latest if loop.stamp_ns < before_ns]
-        for loop in settled:
-            self._table.append_fields(loop.stamp_ns, loop)
-        self._n_rows, self.latest = self._n_rows + len(settled), self.latest[len(settled) :]
 
 
 class LoopDetector:
@@ -99,8 +58,8 @@ class LoopDetector:
     most of the view. It is a loop when another one confirms it: two loops of neighbouring frames,
     or of a frame to neighbouring places, and the odometry between them agree.
 
-    Where odometry was lost it goes on in another world, whose place among the others is not known
-    until a loop tells: its first frames search all other places, whatever they look like.
+    After a gap odometry goes on in another part, whose place among the others is not known until a
+    loop tells: its first frames search all other places, whatever they look like.
 
     Parameters
     ----------
@@ -109,10 +68,13 @@ class LoopDetector:
     config : Config, optional
     frontend : Recognizer, optional
         In place of the one that the configuration names.
+    graph : RunGraph, optional
+        Where the frames are, which of them measurements connect, and which loops odometry allows.
+        Without it all frames are connected, and where they were when they were seen.
 
     Attributes
     ----------
-    loops : sequence of Loop
+    loops : list of Loop
         All that were registered; those without a reason against them are confirmed.
     variance_factor : float
         Of the covariances of loops to come, where registrations are less certain than they state.
@@ -124,6 +86,7 @@ class LoopDetector:
         config: Config | None = None,
         *,
         frontend: Recognizer | None = None,
+        graph: RunGraph | None = None,
     ) -> None:
         if frontend is None and camera is None:
             raise ValueError("LoopDetector needs a camera, or a front-end (frontend=...)")
@@ -133,20 +96,25 @@ class LoopDetector:
         self._visits: dict[int, _Visit] = {}
         self._indexed: list[_Visit] = []
         self._recent: list[_Visit] = []
-        self._world = 0
-        self._connected: set[int] = set()
+        self._graph = graph
+        # Of the frame that is looked at.
+        self._part = 0
         self._n_searches: dict[int, int] = {}
         self._n_paused = 0
-        self.loops = _Loops()
+        # Those that a later one may confirm begin there.
+        self.loops: list[Loop] = []
+        self._n_settled = 0
         self.variance_factor = 1.0
 
-    def reconfigure(self, frontend: Recognizer, *, keeps_places: bool) -> None:
-        """Go on with another front-end; places of another kind are not searched any more."""
+    def reconfigure(self, frontend: Recognizer) -> None:
+        """Go on with another front-end."""
         self._follow(frontend)
-        if not keeps_places:
-            self._index, self._visits = PlaceIndex(), {}
-            self._indexed, self._recent = [], []
-            self.loops.settle()
+
+    def forget_places(self) -> None:
+        """Search no more of the places so far."""
+        self._index, self._visits = PlaceIndex(), {}
+        self._indexed, self._recent = [], []
+        self._n_settled = len(self.loops)
 
     def _follow(self, frontend: Recognizer) -> None:
         self._frontend = frontend
@@ -182,65 +150,78 @@ class LoopDetector:
         T_world_frame: FloatArray,
         *,
         near: Container[int] = (),
-        world: int = 0,
+        part: int | None = None,
         is_keyframe: bool = True,
-        allows: Callable[[Loop], bool] = lambda _: True,
     ) -> tuple[Loop, ...]:
         """Detect, by what a front-end extracted; places whose stamps are `near` are no loops.
 
         A frame that shows most of the latest place is none of its own, and nothing is looked for.
-        Those that are no keyframes are looked at only in a `world` that is not connected with the
-        others, and are places where they are found. What confirms a loop to another world is
-        asked of `allows` too: how far the camera may have come in the dark.
+        Those that are no keyframes are looked at only in a `part` that is not connected with the
+        first one, and are places where they are found.
         """
-        if world != self._world:
-            self.loops.settle()
-            while self._recent:  # odometry does not know where they are any more
-                self._keep_oldest_recent()
-        self._world = world
-        is_search = self._is_search(world, T_world_frame)
+        self._begin_part(part or 0)
+        is_search = self._is_search(T_world_frame)
         is_place = is_keyframe and not self._shows_latest(T_world_frame)
         if not (is_search or is_place):
             return ()
         describe = self._describe_densely if is_search else self._frontend.describe
         place = describe(observations)
         scores = self._index.scores(place.descriptors_left)
-        visits = self._elsewhere(scores, world) if is_search else self._candidates(scores, near)
-        loops = self._register(visits, place, observations)
+        visits = self._elsewhere(scores) if is_search else self._candidates(scores, near)
+        loops = self._register(visits, place, observations, is_search=is_search)
         if not is_place and not loops:
             return ()
         self._add(place, T_world_frame)
         if not loops:
             return ()
-        confirmed = self._confirm(loops, allows)
+        confirmed = self._confirm(loops)
         return tuple(confirmed or self._confirm_alone(loops[0], place, observations))
 
     def keep(self, observations: Any, T_world_frame: FloatArray) -> None:  # noqa: ANN401
-        """Add a frame of the latest world as a place, without looking."""
+        """Add a frame of the latest part as a place, without looking."""
         self._add(self._describe_densely(observations), T_world_frame)
 
     def _add(self, place: Any, T_world_frame: FloatArray) -> None:  # noqa: ANN401
-        visit = _Visit(place=place, T_world_frame=T_world_frame, world=self._world)
+        visit = _Visit(place=place, T_world_frame=T_world_frame)
         self._visits[place.stamp_ns] = visit
         self._recent.append(visit)
         if len(self._recent) > _N_RECENT:
             self._keep_oldest_recent()
 
-    def _is_search(self, world: int, T_world_frame: FloatArray) -> bool:
-        """Tell whether a frame of a world searches all others: until it is connected, and eagerly.
+    def _part_of(self, stamp_ns: int) -> int:
+        """Return the part of a frame, which may be the one that is looked at."""
+        if self._graph is None:
+            return 0
+        return self._graph.parts.of(stamp_ns) if stamp_ns in self._graph.path else self._part
 
-        Once it is connected, a frame that shows what another one showed would only repeat it.
+    def _pose(self, visit: _Visit) -> FloatArray:
+        """Return where odometry now says that a place was seen."""
+        stamp_ns = visit.place.stamp_ns
+        if self._graph is None or stamp_ns not in self._graph.path:
+            return visit.T_world_frame
+        return self._graph.path.pose(stamp_ns)
+
+    def _begin_part(self, part: int) -> None:
+        """Note the part of the next frame; odometry does not know where the latest places are."""
+        self._part = part
+        if self._recent and self._part_of(self._recent[-1].place.stamp_ns) != part:
+            self._n_settled = len(self.loops)
+            while self._recent:
+                self._keep_oldest_recent()
+
+    def _is_search(self, T_world_frame: FloatArray) -> bool:
+        """Tell whether a frame searches all other parts: eagerly at first, then ever more rarely.
+
+        A frame that shows what another one showed would only repeat it.
         """
-        if not self._visits:
-            self._connected.add(world)
-        n_searches = self._n_searches.setdefault(world, 0 if self._visits else _N_EAGER)
-        is_late = n_searches >= _N_EAGER
-        if world in self._connected and (is_late or self._shows_latest(T_world_frame)):
+        part = self._part
+        if not self._visits or part == self._part_of(next(iter(self._visits))):
             return False
+        n_searches = self._n_searches.setdefault(part, 0)
         self._n_paused += 1
         if self._n_paused <= min(n_searches - _N_EAGER, _MAX_PAUSE):
             return False
-        self._n_searches[world], self._n_paused = n_searches + 1, 0
+        self._n_searches[part], self._n_paused = n_searches + 1, 0
         return True
 
     def _register(
@@ -248,14 +229,16 @@ class LoopDetector:
         visits: Iterable[_Visit],
         place: Any,  # noqa: ANN401
         observations: Any,  # noqa: ANN401
+        *,
+        is_search: bool = False,
     ) -> list[Loop]:
-        """Return the first loop; from a world that is not connected, all: they may contradict."""
+        """Return the first loop; of a search all, since they may contradict each other."""
         loops = []
         for visit in visits:
             result = self._frontend.recognize(visit.place, place, observations)
             if isinstance(result, RelativePose):
                 loops.append(self._loop(visit, place, result))
-                if self._world in self._connected:
+                if not is_search:
                     break
         return loops
 
@@ -274,8 +257,7 @@ class LoopDetector:
         """Add the oldest of the latest places to the index, unless another frame knows it."""
         visit = self._recent.pop(0)
         stamp_ns = visit.place.stamp_ns
-        newest = reversed(self.loops)
-        newest = takewhile(lambda loop: loop.stamp_ns >= stamp_ns, newest)
+        newest = takewhile(lambda loop: loop.stamp_ns >= stamp_ns, reversed(self.loops))
         if any(loop.stamp_ns == stamp_ns and not loop.reason for loop in newest):
             del self._visits[stamp_ns]
         else:
@@ -287,13 +269,17 @@ class LoopDetector:
 
     def _shows(self, T_world_frame: FloatArray, visit: _Visit) -> bool:
         """Tell whether a frame shows most of a place, by odometry."""
-        T = se3.invert(T_world_frame) @ visit.T_world_frame
+        T = se3.invert(T_world_frame) @ self._pose(visit)
         return view_overlap(visit.place.points_cam, T, self._frontend.camera) > _MAX_OVERLAP
 
-    def _elsewhere(self, scores: FloatArray, world: int) -> list[_Visit]:
-        """Return the places of other worlds that a view is most like."""
+    def _elsewhere(self, scores: FloatArray) -> list[_Visit]:
+        """Return the places of other parts that a view is most like."""
         best = (self._indexed[k] for k in np.argsort(-scores))
-        return [visit for visit in best if visit.world != world][:_N_CANDIDATES]
+        return list(islice((x for x in best if self._is_apart(x.place.stamp_ns)), _N_CANDIDATES))
+
+    def _is_apart(self, stamp_ns: int) -> bool:
+        """Tell whether a frame is in another part than the one that is looked at."""
+        return self._part_of(stamp_ns) != self._part
 
     def _candidates(self, scores: FloatArray, near: Container[int]) -> list[_Visit]:
         if len(scores) == 0:
@@ -303,31 +289,44 @@ class LoopDetector:
         chosen = (self._indexed[k] for k in best if scores[k] >= limit)
         return [visit for visit in chosen if visit.place.stamp_ns not in near][:_N_CANDIDATES]
 
-    def _confirm(self, loops: Sequence[Loop], allows: Callable[[Loop], bool]) -> list[Loop]:
-        """Return the loops that are confirmed with the first of a frame, this one among them."""
+    def _confirm(self, loops: Sequence[Loop]) -> list[Loop]:
+        """Return the loops that are confirmed with the first of a frame, this one among them.
+
+        One to another part is not if odometry cannot have come there, or more of the latest loops
+        contradict it.
+        """
         loop = loops[0]
-        world, reference_world = self._worlds_of(loop)
         if any(self._contradict(loop, other) for other in loops[1:]):
             loop = replace(loop, reason=_AMBIGUOUS)
-        self.loops.settle(self._recent[-1 - _N_WAITING :][0].place.stamp_ns)
-        latest, confirmed = list(self.loops.latest), []
-        agreeing = [k for k, other in enumerate(latest) if self._agree(other, loop)]
-        if world != reference_world and world not in self._connected:
-            n_against = sum(self._contradict(other, loop) for other in latest)
-            agreeing = [k for k in agreeing if allows(latest[k])]
+        waiting_ns = self._recent[-1 - _N_WAITING :][0].place.stamp_ns
+        while (
+            self._n_settled < len(self.loops) and self.loops[self._n_settled].stamp_ns < waiting_ns
+        ):
+            self._n_settled += 1
+        latest = range(self._n_settled, len(self.loops))
+        agreeing = [k for k in latest if self._agree(self.loops[k], loop)]
+        if self._is_apart(loop.reference_ns):
+            n_against = sum(self._contradict(self.loops[k], loop) for k in latest)
+            agreeing = [k for k in agreeing if self._allows(self.loops[k])]
             agreeing = agreeing if len(agreeing) > n_against else []
-        for k in agreeing:
-            if latest[k].reason:
-                latest[k] = replace(latest[k], reason="")
-                confirmed.append(latest[k])
-        if agreeing:
-            confirmed.append(loop := replace(loop, reason=""))
-        if agreeing and world != reference_world:
-            self._connected.add(world)
-        elif world not in self._connected and loop.reason != _AMBIGUOUS:  # the next may confirm it
-            self._n_searches[world] = min(self._n_searches[world], _N_EAGER - _N_WAITING)
-        self.loops.latest = *latest, loop
-        return confirmed
+            self._note_search(loop, is_found=bool(agreeing))
+        loop = replace(loop, reason="") if agreeing else loop
+        confirmed = [k for k in agreeing if self.loops[k].reason]
+        for k in confirmed:
+            self.loops[k] = replace(self.loops[k], reason="")
+        self.loops.append(loop)
+        return [self.loops[k] for k in confirmed] + [loop] * bool(agreeing)
+
+    def _allows(self, loop: Loop) -> bool:
+        return self._graph is None or self._graph.allows(loop)
+
+    def _note_search(self, loop: Loop, *, is_found: bool) -> None:
+        """Search rarely after a loop was found; eagerly while the next frame may confirm one."""
+        n_searches = self._n_searches.get(self._part, 0)
+        if is_found:
+            self._n_searches[self._part] = _N_EAGER + _MAX_PAUSE
+        elif loop.reason != _AMBIGUOUS and self._allows(loop):
+            self._n_searches[self._part] = min(n_searches, _N_EAGER - _N_WAITING)
 
     def _confirm_alone(
         self,
@@ -340,34 +339,38 @@ class LoopDetector:
         No other frame may follow that could tell. One that shows the same place tells no more than
         another place of this frame does, where these two are as far apart.
         """
-        if not self._connected.issuperset(self._worlds_of(loop)):
+        if self._is_apart(loop.reference_ns):
             return []
         reference = self._visits[loop.reference_ns]
         number = self._indexed.index(reference)
         for other in self._indexed[max(number - _N_BESIDE, 0) : number + _N_BESIDE + 1]:
             is_earlier = other.place.stamp_ns < loop.reference_ns
             earlier, later = (other, reference) if is_earlier else (reference, other)
-            is_apart = not self._shows(later.T_world_frame, earlier)
-            seconds = self._register([other], place, observations) if is_apart else []
+            is_other = not self._shows(self._pose(later), earlier)
+            seconds = self._register([other], place, observations) if is_other else []
             if any(self._agree(second, loop) for second in seconds):
-                loop = replace(loop, reason="")
-                self.loops.latest = *self.loops.latest[:-1], loop
-                return [loop]
+                self.loops[-1] = replace(loop, reason="")
+                return self.loops[-1:]
         return []
 
-    def _worlds_of(self, loop: Loop) -> tuple[int, int]:
-        """Return the worlds of a loop's frame and of its reference."""
-        return self._visits[loop.stamp_ns].world, self._visits[loop.reference_ns].world
-
     def _contradict(self, first: Loop, second: Loop) -> bool:
-        """Tell whether two loops between the same worlds disagree: one place looks like another."""
-        is_same = self._worlds_of(first) == self._worlds_of(second)
-        return is_same and not self._agree(first, second)
+        """Tell whether two loops between the same parts disagree: one place looks like another."""
+        return self._lead_alike(first, second) and not self._agree(first, second)
+
+    def _lead_alike(self, first: Loop, second: Loop) -> bool:
+        """Tell whether two loops lead from one part to one part."""
+        return all(
+            self._part_of(a) == self._part_of(b)
+            for a, b in (
+                (first.stamp_ns, second.stamp_ns),
+                (first.reference_ns, second.reference_ns),
+            )
+        )
 
     def _agree(self, first: Loop, second: Loop) -> bool:
         """Tell whether two loops and the odometry between their ends agree."""
-        is_apart = self._worlds_of(first)[1] != self._worlds_of(second)[1]
-        if is_apart or _AMBIGUOUS in (first.reason, second.reason):
+        is_ambiguous = _AMBIGUOUS in (first.reason, second.reason)
+        if is_ambiguous or not self._lead_alike(first, second):
             return False
         T_first_second, drift = self._way(first.stamp_ns, second.stamp_ns)
         T_references, other_drift = self._way(first.reference_ns, second.reference_ns)
@@ -380,64 +383,7 @@ class LoopDetector:
     def _way(self, first_ns: int, second_ns: int) -> tuple[FloatArray, FloatArray]:
         """Return the motion between two places by odometry, and variances of its drift (6,)."""
         first, second = (self._visits[ns] for ns in (first_ns, second_ns))
-        T = se3.invert(first.T_world_frame) @ second.T_world_frame
+        T = se3.invert(self._pose(first)) @ self._pose(second)
         length, angle = float(np.linalg.norm(T[:3, 3])), float(se3.rotation_angle(T))
         turn = (_DRIFT * angle) ** 2 + (_DRIFT * 0.1 * length) ** 2
         return T, np.repeat([turn, (_DRIFT * length) ** 2], 3)
-
-
-class Segments:
-    """Which segment a run is in, and which ones are joined.
-
-    While the camera is lost its pose is a guess that nobody should rely on. The frames after that
-    are a segment of their own, somewhere in the world: where, only a loop to a place of an earlier
-    segment can tell.
-    """
-
-    def __init__(self) -> None:
-        self._starts_ns: list[int] = []
-        self._groups = [0]
-        self._is_lost = False
-
-    @property
-    def current(self) -> int:
-        """The segment of the latest frame."""
-        return len(self._starts_ns)
-
-    def segment_of(self, stamp_ns: int) -> int:
-        """Return the segment of an earlier frame."""
-        return bisect_right(self._starts_ns, stamp_ns)
-
-    def note_frame(self, stamp_ns: int, status: Status) -> None:
-        """Add a frame; the first one that is lost begins a segment."""
-        if status is Status.LOST and not self._is_lost:
-            self._starts_ns.append(stamp_ns)
-            self._groups.append(self.current)
-        self._is_lost = status is Status.LOST
-
-    def unjoined(self, stamps_ns: Iterable[int]) -> list[int]:
-        """Return the keyframes of segments that the current one is not joined to."""
-        present = self._groups[self.current]
-        return [ns for ns in stamps_ns if self._groups[self.segment_of(ns)] != present]
-
-    def join(self, stamp_ns: int, reference_ns: int) -> SegmentJoin | None:
-        """Join the segment of a frame to that of an earlier one, and to all that are joined to it.
-
-        Parameters
-        ----------
-        stamp_ns, reference_ns : int
-            The frame, and the one that it was registered against.
-
-        Returns
-        -------
-        SegmentJoin or None
-            None where they are joined already.
-        """
-        segment, other = self.segment_of(stamp_ns), self.segment_of(reference_ns)
-        present, former = self._groups[segment], self._groups[other]
-        if present == former:
-            return None
-        self._groups = [former if group == present else group for group in self._groups]
-        return SegmentJoin(
-            segment=segment, to_segment=other, stamp_ns=stamp_ns, reference_ns=reference_ns
-        )

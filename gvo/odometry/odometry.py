@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -24,7 +24,7 @@ from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.odometry.chain import RawChain, RawStep
 from gvo.odometry.graph import RunGraph
 from gvo.odometry.keyframes import Keyframes, judge_links, link_keyframes, misclosure
-from gvo.odometry.loops import LoopDetector, Segments
+from gvo.odometry.map import Map
 from gvo.types import (
     Edge,
     Estimate,
@@ -90,13 +90,12 @@ class Odometry:
         self._chain: RawChain[Any] = RawChain(self._frontend, self._config.window)
         self._window = SlidingWindow(self._config.window)
         self._keyframes: Keyframes[Any] = Keyframes(self._view(), self._config.window)
-        self._segments = Segments()
         # Keyframes by the raw chain, which was not broken since, and whether it ever was.
         self._starts: dict[int, Estimate] = {}
         self._is_broken = False
         self._anchor_ns: int | None = None
         self._previous: Estimate | None = None  # by the raw chain
-        self._begin_map()
+        self._map = Map(self._config, self._frontend.recognizer, self._window, self._keyframes)
         self._trust = DepthTrust()
         # The last frame and the last registered one, to be extracted again after a change.
         self._frames: dict[int, Stamped] = {}
@@ -113,8 +112,8 @@ class Odometry:
 
     @property
     def graph(self) -> RunGraph:
-        """The graph of all keyframes so far, and its loops."""
-        return self._graph
+        """The graph of all frames so far, and its loops."""
+        return self._map.graph
 
     @property
     def T_map_world(self) -> FloatArray:  # noqa: N802 - the field's name
@@ -122,7 +121,7 @@ class Odometry:
 
         Optimized in a thread while the run goes, some keyframes behind; the identity until then.
         """
-        return self._graph.T_map_world
+        return self._map.graph.T_map_world
 
     @property
     def rig_offsets(self) -> RigOffsets | None:
@@ -191,33 +190,38 @@ class Odometry:
             step = self._chain.advance(
                 observations,
                 variance_factor=1.0 if offsets is None else offsets.chain_factor.value,
-                seeks_places=self._searching() is not None,
+                seeks_places=self._map.seeks_places,
             )
             self._note_break(step)
         with watch.stage("links"):
+            self._map.follow(step)
             scores, offered = self._link(observations, step)
             offered += self._align_depths(observations, offered)
         with watch.stage("loops"):
-            found = self._look_early(observations, step, scores)
-            joining = self._join(found)
+            links = [edge for kind, edge in offered if kind == "keyframe"]
+            is_needed = self._is_keyframe_needed(scores)
+            found = self._map.search(observations, step, links, is_keyframe=is_needed)
+            joining = self._map.joining(found)
         with watch.stage("window"):
-            offered += joining
-            causal = self._add_to_window(step, offered, is_resumed=bool(joining))
+            offered += [] if joining is None else [("keyframe", joining)]
+            causal = self._add_to_window(step, offered, is_resumed=joining is not None)
             if offsets is not None:
                 offsets.window_factor.note(self._window.misfit)
             T_previous_frame = self._last_step(step.estimate, causal)
-            joins = self._join_segments(causal)
             self._select_keyframes(observations, step, scores, causal)
             self._keep_anchor()
         with watch.stage("loops"):
-            loops = self._close_loops(observations, causal, found)
+            self._map.variance_factor = self._trust.variance_factor
+            joins, loops = self._map.add(observations, causal, found, self._chain.anchor)
         self._keep_frame(frame)
         poses = causal, T_previous_frame
         return self._result(observations, step, offered, *poses, joins, loops, watch.stage_ms)
 
     def finish(self) -> tuple[Estimate, ...]:
         """Return the smoothed poses of the frames still in the window."""
-        return tuple(self._window.finish())
+        finished = tuple(self._window.finish())
+        self._map.graph.settle(finished)
+        return finished
 
     def optimize(self) -> Optimum:
         """Return the poses of all frames so far that fit all that was measured best.
@@ -230,7 +234,9 @@ class Odometry:
         SmoothingError
             When GTSAM fails; before the first frame, and where `loops.enabled` is false.
         """
-        return self._graph.optimize()
+        graph = self._map.graph
+        graph.settle(self._window.estimate(frame_id) for frame_id in self._window.poses())
+        return graph.optimize()
 
     def _result(
         self,
@@ -245,10 +251,12 @@ class Odometry:
     ) -> FrameResult:
         n_keypoints, n_points = count_points(observations)
         answer = step.registration or step.failure
+        finished = tuple(self._window.pop_finished())
+        self._map.graph.settle(finished)
         return FrameResult(
             raw=replace(step.estimate, frame_id=step.estimate.stamp_ns),
             causal=causal,
-            finished=tuple(self._window.pop_finished()),
+            finished=finished,
             status=causal.status,
             reason="" if step.failure is None else step.failure.reason,
             n_keypoints=n_keypoints,
@@ -259,19 +267,13 @@ class Odometry:
             registration=step.registration,
             links=judge_links(offered, step.estimate.stamp_ns, self._window),
             keyframes_ns=tuple(self._keyframes.stamps_ns),
-            segment=self._segments.current,
+            segment=self._map.segment,
             joins=joins,
             loops=loops,
             T_previous_frame=T_previous_frame,
-            T_map_world=self._graph.T_map_world,
+            T_map_world=self.T_map_world,
             stage_ms=stage_ms,
         )
-
-    def _begin_map(self) -> None:
-        """Begin the graph of the run, with a detector where the front-end can find places again."""
-        self._graph, frontend = RunGraph(self._config.window), self._frontend.recognizer
-        self._loops = None if frontend is None else LoopDetector(frontend=frontend)
-        self._graph.loops = () if self._loops is None else self._loops.loops
 
     def _view(self) -> StereoCamera | None:
         """Return the camera of the view overlap."""
@@ -287,9 +289,7 @@ class Odometry:
         self._window.reconfigure(self._config.window)
         self._keyframes.reconfigure(self._view(), self._config.window)
         self._chain.reconfigure(self._frontend, self._config.window, extracted)
-        self._graph.reconfigure(self._config.window)
-        if not former.loops.enabled:
-            self._begin_map()
+        self._map.reconfigure(self._config, self._frontend.recognizer)
 
     def _renew_frontend(self, former: Config) -> dict[int, Any]:
         """Return what a new front-end extracts from the last frames, where that has changed."""
@@ -303,9 +303,8 @@ class Odometry:
                 offsets.reconfigure(self._config)
             frontend = make_frontend(camera, self._config, rig_offsets=offsets)
             self._frontend = CheckedFrontend(frontend)
-            if self._loops is not None and self._frontend.recognizer is not None:
-                keeps_places = not change.is_of_kind
-                self._loops.reconfigure(self._frontend.recognizer, keeps_places=keeps_places)
+            if change.is_of_kind:
+                self._map.forget_places()
         extracted = {}
         if change.is_of_extraction:
             frames = sorted(self._frames.items())
@@ -355,11 +354,11 @@ class Odometry:
         """Return T_frame_keyframe by stamp, of joined segments, as predicted by the step."""
         T_world_frame = self._window.pose(step.reference_ns) @ step.T_reference_frame
         T_frame_world = se3.invert(T_world_frame)
-        unjoined = self._unjoined()
+        hidden_ns = self._map.hidden_ns
         return {
             ns: T_frame_world @ self._window.pose(ns)
             for ns in self._keyframes.stamps_ns
-            if ns in self._window and ns not in unjoined
+            if ns in self._window and ns not in hidden_ns
         }
 
     def _register_keyframe(
@@ -420,32 +419,6 @@ class Odometry:
         T = depth.T_reference_current
         return Edge(reference_id=link.reference_id, T_reference_frame=T, covariance=covariance)
 
-    def _unjoined(self) -> list[int]:
-        """Return the keyframes of earlier segments that the current one is not joined to."""
-        return self._segments.unjoined(self._keyframes.stamps_ns)
-
-    def _look_early(
-        self, observations: _Observations, step: RawStep, scores: dict[int, float]
-    ) -> tuple[Loop, ...] | None:
-        """Look for places before the window takes the frame, if its segment is not joined."""
-        is_there = step.registration is not None and step.reference_ns in self._window
-        if not is_there or not self._unjoined():
-            return None
-        T_world_frame = self._window.pose(step.reference_ns) @ step.T_reference_frame
-        is_keyframe = self._is_keyframe_needed(scores)
-        return self._look(observations, T_world_frame, [step.edge], is_keyframe=is_keyframe)
-
-    def _join(self, loops: Sequence[Loop] | None) -> list[_Offer]:
-        """Return the edge that loops give to a keyframe of another segment in the window."""
-        if not loops:
-            return []
-        loop, segment_of = loops[-1], self._segments.segment_of  # the last one is of this frame
-        there = segment_of(loop.reference_ns)
-        kept = [ns for ns in self._unjoined() if ns in self._window and segment_of(ns) == there]
-        nearest = min(kept, key=lambda ns: abs(ns - loop.reference_ns), default=None)
-        edge = None if nearest is None else self._graph.from_keyframe(nearest, loop)
-        return [] if edge is None else [("keyframe", edge)]
-
     def _add_to_window(self, step: RawStep, offered: list[_Offer], *, is_resumed: bool) -> Estimate:
         stamp_ns = step.estimate.stamp_ns
         edges = [edge for _, edge in offered]
@@ -461,14 +434,6 @@ class Odometry:
             T_world_previous = self._window.pose(previous.stamp_ns)
             return np.asarray(se3.invert(T_world_previous) @ causal.T_world_frame)
         return np.asarray(se3.invert(previous.T_world_frame) @ raw.T_world_frame)
-
-    def _join_segments(self, causal: Estimate) -> tuple[SegmentJoin, ...]:
-        """Return the segments that the accepted edges of a frame join."""
-        stamp_ns = causal.stamp_ns
-        self._segments.note_frame(stamp_ns, causal.status)
-        ties_ns = [int(edge.reference_id) for edge in self._window.edges(stamp_ns)]  # type: ignore[call-overload]
-        joins = [self._segments.join(stamp_ns, tie_ns) for tie_ns in ties_ns]
-        return tuple(join for join in joins if join is not None)
 
     def _select_keyframes(
         self, observations: _Observations, step: RawStep, scores: dict[int, float], causal: Estimate
@@ -489,7 +454,7 @@ class Odometry:
         return config.n_keyframes > 0 and is_needed(self._keyframes.registrable(scores))
 
     def _release_keyframes(self, scores: dict[int, float], n_steps: int) -> None:
-        config, unjoined = self._config.window, self._unjoined()
+        config, unjoined = self._config.window, self._map.unjoined_ns
         n_over = len(self._keyframes) - len(unjoined) - config.n_keyframes
         released = choose_unseen(scores, self._keyframes.n_unseen(n_steps), max(n_over, 0))
         for stamp_ns in released + unjoined[: max(len(unjoined) - config.n_keyframes, 0)]:
@@ -500,61 +465,6 @@ class Odometry:
                 self._keyframes.drop(stamp_ns)
         kept_ns = self._keyframes.stamps_ns
         self._starts = {ns: each for ns, each in self._starts.items() if ns in kept_ns}
-
-    def _searching(self) -> LoopDetector | None:
-        """Return what searches places; None where that is switched off or cannot be done."""
-        return self._loops if self._config.loops.enabled else None
-
-    def _look(
-        self,
-        observations: _Observations,
-        T_world_frame: FloatArray,
-        edges: Sequence[Edge],
-        *,
-        is_keyframe: bool,
-    ) -> tuple[Loop, ...]:
-        """Return the loops that are confirmed with a frame."""
-        detector = self._searching()
-        if detector is None:
-            return ()
-        detector.variance_factor = self._trust.variance_factor
-        return detector.look(
-            observations,
-            T_world_frame,
-            near=set(self._keyframes.stamps_ns).difference(self._unjoined()),
-            world=self._graph.world_of(edges),
-            is_keyframe=is_keyframe,
-            allows=self._graph.allows,
-        )
-
-    def _close_loops(
-        self, observations: _Observations, causal: Estimate, loops: tuple[Loop, ...] | None
-    ) -> tuple[Loop, ...]:
-        """Add a frame to the graph of the run, and the loops of a keyframe, if not found early."""
-        if not self._config.loops.enabled:
-            return ()
-        stamp_ns = causal.stamp_ns
-        edges, is_keyframe = self._window.edges(stamp_ns), stamp_ns in self._keyframes.stamps_ns
-        if loops is None and causal.status in (Status.OK, Status.RESUMED):
-            T_world_frame = causal.T_world_frame
-            loops = self._look(observations, T_world_frame, edges, is_keyframe=is_keyframe)
-        is_keyframe = is_keyframe or (self._loops is not None and stamp_ns in self._loops)
-        self._graph.add_frame(causal, edges, is_keyframe=is_keyframe)
-        if not edges:
-            self._keep_last_seen()
-        if is_keyframe and loops is not None and self._loops is not None:
-            self._graph.advance(loops, self._loops)
-        return loops or ()
-
-    def _keep_last_seen(self) -> None:
-        """Make the last registered frame a place: it is what a lost camera may see again."""
-        anchor = self._chain.anchor
-        if self._loops is None or anchor is None:
-            return
-        stamp_ns = anchor.stamp_ns
-        is_there = stamp_ns in self._graph and stamp_ns in self._window
-        if is_there and stamp_ns not in self._loops:
-            self._loops.keep(anchor, self._window.pose(stamp_ns))
 
     def _keep_anchor(self) -> None:
         """Keep the frame that the chain comes back to, however long it coasts."""

@@ -73,15 +73,15 @@ def optimum_json(optimum: Optimum | None) -> dict[str, Any] | None:
         return None
     refused = Counter(loop.reason for loop in optimum.loops)
     return {
-        "keyframes": len(optimum.keyframes_ns),
+        "frames": len(optimum.frames_ns),
         "edges": len(optimum.edges),
         "loops": {
             "found": len(optimum.loops),
             "counted": refused.pop("", 0),
             "refused": dict(refused),
         },
-        "error_before": float(optimum.error_before),
-        "error": float(optimum.error),
+        "error_before": optimum.error_before,
+        "error": optimum.error,
         "iterations": optimum.n_iterations,
     }
 

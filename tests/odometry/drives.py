@@ -71,14 +71,13 @@ class Drive:
         bias: Bias = None,
         sigmas: FloatArray = SIGMAS,
         config: WindowConfig | None = None,
+        max_frames: int = 3000,
     ) -> None:
         self.truth, self.rng, self.bias, self.sigmas = truth, rng, bias, sigmas
-        self.graph = RunGraph(config or WindowConfig())
+        self.graph = RunGraph(config or WindowConfig(), max_frames=max_frames)
         self.every, self.n_links = every, n_links
         self.keyframes = [0]
         self.edges: list[list[Edge]] = []
-        # Of each lap, the numbers of keyframes, edges and places.
-        self.sizes: list[tuple[int, int, int]] = []
         self.T = truth[0]
 
     def step(self, j: int) -> None:
@@ -94,7 +93,7 @@ class Drive:
         is_keyframe = j % self.every == 0
         estimate = estimate_at(j * PERIOD_NS, self.T, frame_id=j * PERIOD_NS)
         self.edges.append(edges)
-        self.graph.add_frame(estimate, edges, is_keyframe=is_keyframe)
+        self.graph.add_frame(estimate, edges, is_place=is_keyframe)
         if is_keyframe and j > 0:
             self.keyframes.append(j)
 
@@ -171,20 +170,15 @@ class MadeUpPlaces:
         )
 
 
-def go_round(
-    truth: FloatArray, n_per_lap: int, *, n_links: int = 2, bias: Bias = None
-) -> tuple[Drive, LoopDetector]:
-    """Drive with loops, found by made-up places; return the drive and the detector."""
-    drive = Drive(truth, np.random.default_rng(1), n_links=n_links, bias=bias)
-    frontend = MadeUpPlaces(truth, n_per_lap)
-    detector = LoopDetector(frontend=frontend)
+def go_round(truth: FloatArray, n_per_lap: int, *, bias: Bias = None) -> Drive:
+    """Drive with loops, found by made-up places."""
+    drive = Drive(truth, np.random.default_rng(1), bias=bias)
+    detector = LoopDetector(frontend=MadeUpPlaces(truth, n_per_lap), graph=drive.graph)
     drive.graph.loops = detector.loops
     for j in range(len(truth)):
         drive.step(j)
         if j % drive.every == 0:
             near = {k * PERIOD_NS for k in drive.keyframes[-10:]}
             loops = detector.look(j, drive.T, near=near)
-            drive.graph.advance(loops, detector)
-        if (j + 1) % n_per_lap == 0:
-            drive.sizes.append((len(drive.graph), len(drive.graph._edges), len(detector)))
-    return drive, detector
+            drive.graph.advance(is_looped=bool(loops))
+    return drive

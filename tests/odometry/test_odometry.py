@@ -346,7 +346,7 @@ def test_coasting_for_long_is_called_lost_until_it_resumes() -> None:
         [Status.COASTING] * 2 + [Status.LOST] * 4 + [Status.RESUMED] * 2 + [Status.OK]
     )
     # The light comes on where it went out: two frames see the place of the last registered one.
-    assert [result.segment for result in results] == [0] * 5 + [1] * 7
+    assert [result.segment for result in results] == [0] * 9 + [1] + [0] * 2
     assert [len(result.joins) for result in results] == [0] * 10 + [1, 0]
 
 

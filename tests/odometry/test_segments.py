@@ -13,15 +13,14 @@ from gvo.config import Config
 from gvo.errors import SmoothingError
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
-from gvo.odometry.loops import Segments
 from gvo.odometry.odometry import Odometry
+from gvo.odometry.parts import Parts
 from gvo.types import (
     Failure,
     FloatArray,
     FrameResult,
     MotionPrior,
     RelativePose,
-    SegmentJoin,
     Status,
 )
 
@@ -144,13 +143,14 @@ def errors(results: list[FrameResult], places: list[Place]) -> list[float]:
 AWAY = at(4.0, turn=0.8)
 
 
-def test_a_segment_begins_with_the_first_lost_frame() -> None:
+def test_a_segment_begins_with_the_first_frame_after_a_gap() -> None:
     results = run(Beacon(see=lambda _: None), walk(away=AWAY))
     statuses = [result.status for result in results]
     first = statuses.index(Status.LOST)
     # 0.35 s after the last frame that was tied, the tenth.
     assert first == 9 + 4
-    assert [result.segment for result in results] == [0] * first + [1] * (len(results) - first)
+    # The first frame that is registered again begins it.
+    assert [result.segment for result in results] == [0] * 17 + [1] * (len(results) - 17)
     assert statuses[16:18] == [Status.LOST, Status.RESUMED]
     assert set(statuses[18:]) == {Status.OK}
 
@@ -159,7 +159,7 @@ def test_a_gap_without_frames_is_as_long_as_one_of_dark_frames() -> None:
     places = [place for place in walk(away=AWAY) if not place.is_dark]
     results = run(Beacon(see=lambda _: None), places)
     assert results[10].status is Status.LOST
-    assert [result.segment for result in results] == [0] * 10 + [1] * 12
+    assert [result.segment for result in results] == [0] * 11 + [1] * 11
 
 
 def test_a_keyframe_that_is_seen_twice_joins_the_segments() -> None:
@@ -180,7 +180,8 @@ def test_a_keyframe_that_is_seen_twice_joins_the_segments() -> None:
     sigma = [float(np.sqrt(result.causal.covariance[3, 3])) for result in results]
     assert sigma[joined - 1] > 0.5
     assert max(sigma[joined:]) < 0.2
-    assert {result.segment for result in results[joined:]} == {1}
+    assert [result.segment for result in results[joined - 1 : joined + 1]] == [1, 0]
+    assert {result.segment for result in results[joined:]} == {0}
 
 
 def test_a_join_is_no_step_and_each_step_is_of_one_state_of_the_window() -> None:
@@ -217,11 +218,15 @@ def test_after_a_frame_without_a_window_the_step_is_raw(monkeypatch: pytest.Monk
     np.testing.assert_allclose(step, se3.invert(before) @ after, atol=1e-12)
 
 
-def test_nobody_looks_where_that_is_switched_off() -> None:
-    frontend = Beacon()
-    results = run(frontend, walk(away=AWAY), enabled=False)
-    assert frontend.n_looked == 0
-    assert not any(result.joins for result in results)
+def test_without_loops_the_keyframes_of_the_window_are_looked_for() -> None:
+    places = walk(away=AWAY)
+    results = run(Beacon(), places, enabled=False)
+    assert [(join.segment, join.to_segment) for r in results for join in r.joins] == [(1, 0)]
+    assert max(errors(results, places)[18:]) < 0.02
+    assert not any(result.loops for result in results)
+    # Farther back than the window reaches nothing is known.
+    away = run(Beacon(see=lambda T: T if np.linalg.norm(T[:3, 3]) < 0.3 else None), places)
+    assert not any(result.joins for result in away)
 
 
 def test_the_raw_chain_is_never_joined() -> None:
@@ -232,12 +237,11 @@ def test_the_raw_chain_is_never_joined() -> None:
         np.testing.assert_array_equal(first.raw.T_world_frame, second.raw.T_world_frame)
 
 
-def test_the_light_that_comes_on_where_it_went_out_joins_at_once() -> None:
-    results = run(Plain(), walk(away=at(1.0)))
-    joins = [join for result in results for join in result.joins]
-    assert [(join.segment, join.to_segment) for join in joins] == [(1, 0)]
-    assert joins[0].stamp_ns == 16 * STEP_NS
-    assert joins[0].reference_ns == 9 * STEP_NS
+def test_the_light_that_comes_on_where_it_went_out_begins_no_segment() -> None:
+    places = walk(away=at(1.0))
+    results = run(Plain(), places)
+    assert {result.segment for result in results} == {0}
+    assert max(errors(results, places)[16:]) < 0.02
 
 
 def test_what_looks_for_places_is_not_joined_by_one_frame_that_looks_alike() -> None:
@@ -303,22 +307,19 @@ def test_keyframes_that_wait_are_no_more_than_those_in_use() -> None:
             for place in room
         ]
     results = run(Beacon(see=lambda _: None), places)
-    assert results[-1].segment == 6
+    assert results[-1].segment == 5
     assert max(len(result.keyframes_ns) for result in results) <= 2 * 4
 
 
-def test_segments_that_are_joined_to_the_same_one_are_joined_to_each_other() -> None:
-    segments = Segments()
-    for n in (10, 20, 30):
-        segments.note_frame(n, Status.LOST)
-        segments.note_frame(n + 1, Status.RESUMED)
-    assert segments.current == 3
-    assert segments.unjoined([5, 15, 25, 35]) == [5, 15, 25]
-    assert segments.join(31, 5) == SegmentJoin(segment=3, to_segment=0, stamp_ns=31, reference_ns=5)
-    assert segments.unjoined([5, 15, 25, 35]) == [15, 25]
-    assert segments.join(32, 15) is not None
-    assert segments.unjoined([5, 15, 25, 35]) == [25]
-    assert segments.join(33, 5) is None
+def test_parts_that_are_joined_to_the_same_one_are_joined_to_each_other() -> None:
+    parts = Parts()
+    for n in (0, 10, 20, 30):
+        parts.add(n)
+        parts.add(n + 1, [n])
+    assert [parts.of(n) for n in (1, 11, 21, 31, 99)] == [0, 10, 20, 30, 99]
+    parts.join(31, 1)
+    parts.add(32, [31, 11])
+    assert [parts.of(n) for n in (1, 11, 21, 31, 32)] == [0, 0, 20, 0, 0]
 
 
 def test_what_was_seen_last_is_known_again_though_it_is_no_keyframe() -> None:

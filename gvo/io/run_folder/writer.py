@@ -344,8 +344,8 @@ def _link_rows(result: FrameResult) -> Iterator[Sequence[object]]:
 
 
 def _graph_lines(optimum: Optimum) -> Iterator[str]:
-    """Yield the keyframes, numbered, with their stamps as comments, and the edges between them."""
-    numbers = {stamp_ns: number for number, stamp_ns in enumerate(optimum.keyframes_ns)}
+    """Yield the frames, numbered, with their stamps as comments, and the edges between them."""
+    numbers = {stamp_ns: number for number, stamp_ns in enumerate(optimum.frames_ns)}
     for estimate in optimum.estimates:
         number = numbers.get(estimate.stamp_ns)
         if number is not None:

@@ -1,0 +1,194 @@
+"""The frames of a run as odometry has them, and how certain it is of the way between them."""
+
+from __future__ import annotations
+
+from array import array
+from bisect import bisect_left
+from collections.abc import Iterable
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvo.geometry import se3
+from gvo.types import BoolArray, Edge, Estimate, FloatArray, IntArray, Status
+
+# Odometry may drift by this share of the way, and by so many radians per metre, without its
+# covariances saying so: what calibration leaves is wrong alike in each step.
+_DRIFT = 0.01
+_TURN_PER_M = 0.0005
+
+_STATUSES: Final = tuple(Status)
+_ROW: Final = np.dtype(
+    [
+        ("status", "i1"),
+        ("T", "f8", (4, 4)),
+        ("covariance", "f8", (6, 6)),
+        ("step", "f8", (6, 6)),
+    ]
+)
+
+
+def source_ns(edge: Edge) -> int:
+    """Return the stamp that names the reference of an edge."""
+    return int(edge.reference_id)  # type: ignore[call-overload, no-any-return]
+
+
+class Way(NamedTuple):
+    """The motion from one frame to a later one by odometry.
+
+    Parameters
+    ----------
+    T : ndarray of float64, shape (..., 4, 4)
+        Pose of the later frame in the earlier one.
+    covariance, drift : ndarray of float64, shape (..., 6, 6)
+        Of T, in the later frame: by the covariances of the steps, and by what they may drift.
+    """
+
+    T: FloatArray
+    covariance: FloatArray
+    drift: FloatArray
+
+
+class Path:
+    """Poses of all frames, oldest first, and the covariance of each step from the frame before."""
+
+    def __init__(self) -> None:
+        self.stamps_ns = array("q")
+        self._rows = np.zeros(64, dtype=_ROW)
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.stamps_ns)
+
+    def index(self, stamp_ns: int) -> int:
+        """Return the number of a frame."""
+        return bisect_left(self.stamps_ns, stamp_ns)
+
+    def __contains__(self, stamp_ns: object) -> bool:
+        """Tell whether a frame is there."""
+        if not isinstance(stamp_ns, int):
+            return False
+        index = self.index(stamp_ns)
+        return index < len(self) and self.stamps_ns[index] == stamp_ns
+
+    def append(self, estimate: Estimate, step_covariance: FloatArray) -> None:
+        """Add a frame."""
+        n = len(self)
+        if n == len(self._rows):
+            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
+        self.stamps_ns.append(estimate.stamp_ns)
+        self._rows["step"][n] = step_covariance
+        self.update([estimate])
+
+    def update(self, estimates: Iterable[Estimate]) -> None:
+        """Take over better estimates of frames; those of others are passed over."""
+        for estimate in estimates:
+            if estimate.stamp_ns in self:
+                row = self._rows[self.index(estimate.stamp_ns)]
+                row["T"], row["covariance"] = estimate.T_world_frame, estimate.covariance
+                row["status"] = _STATUSES.index(estimate.status)
+
+    def move(self, is_moved: BoolArray, T_world_world: FloatArray, *, start: int) -> None:
+        """Move some frames; those between `start` and the first of them are bent to fit."""
+        T, end = self.poses, int(np.argmax(is_moved))
+        T[start + 1 : end] = bent(
+            T[start + 1 : end],
+            T[end],
+            T_world_world @ T[end],
+            self.shares(np.arange(start + 1, end), np.array(start), np.array(end)),
+        )
+        T[is_moved] = T_world_world @ T[is_moved]
+
+    def shares(self, frames: IntArray, starts: IntArray, ends: IntArray) -> FloatArray:
+        """Return which share of a move of the end frames takes, that lie between start and end.
+
+        A velocity is wrong in proportion to the time since it was measured, a way to its square.
+        """
+        stamps_ns = np.array(self.stamps_ns)
+        whole_ns = np.maximum(stamps_ns[ends] - stamps_ns[starts], 1)
+        return np.asarray(np.clip((stamps_ns[frames] - stamps_ns[starts]) / whole_ns, 0, 1) ** 2)
+
+    def connect(self, first_ns: int, last_ns: int, covariance: FloatArray) -> None:
+        """State how certain the way between two frames is, since something measured it."""
+        steps, last = self._rows["step"], self.index(last_ns)
+        steps[self.index(first_ns) + 1 : last] = 0.0
+        steps[last] = covariance
+
+    @property
+    def poses(self) -> NDArray[Any]:
+        """T_world_frame of all frames, shape (n, 4, 4)."""
+        return self._rows["T"][: len(self)]
+
+    def pose(self, stamp_ns: int) -> FloatArray:
+        """Return T_world_frame of a frame."""
+        return np.array(self._rows["T"][self.index(stamp_ns)])
+
+    def estimates(
+        self, poses: FloatArray | None = None, covariances: FloatArray | None = None
+    ) -> tuple[Estimate, ...]:
+        """Return all frames; with other poses and covariances, if given."""
+        rows = self._rows[: len(self)]
+        poses = rows["T"] if poses is None else poses
+        covariances = rows["covariance"] if covariances is None else covariances
+        statuses = rows["status"].tolist()
+        columns = zip(self.stamps_ns, statuses, poses, covariances, strict=True)
+        return tuple(
+            Estimate(
+                stamp_ns=stamp_ns,
+                T_world_frame=T,
+                covariance=covariance,
+                status=_STATUSES[status],
+                frame_id=stamp_ns,
+            )
+            for stamp_ns, status, T, covariance in columns
+        )
+
+    def ways(self, starts: IntArray, first: int = 0) -> Way:
+        """Return the ways to all frames after the first one, each from an earlier frame.
+
+        Parameters
+        ----------
+        starts : ndarray of int64, shape (n,)
+            Numbers of the frames that the ways to frames `first + 1`, `first + 2`, ... start from;
+            they do not decrease.
+        first : int
+            The number of the first frame.
+        """
+        rows, since = self._rows[first : first + 1 + len(starts)], starts - first
+        T = se3.invert(rows["T"][since]) @ rows["T"][1:]
+        Ad, back = se3.adjoint(T), se3.adjoint(se3.invert(T))
+        found = []
+        for steps in (rows["step"][1:], _drifts(rows["T"])):
+            total = np.zeros((len(rows), 6, 6))
+            np.cumsum(Ad @ steps @ np.swapaxes(Ad, 1, 2), axis=0, out=total[1:])
+            found.append(back @ (total[1:] - total[since]) @ np.swapaxes(back, 1, 2))
+        # each step drifts alike: the sigmas add up
+        n_steps = np.arange(1, len(rows)) - since
+        return Way(T, found[0], n_steps[:, np.newaxis, np.newaxis] * found[1])
+
+    def way(self, first_ns: int, last_ns: int) -> Way:
+        """Return the way between two frames, the first of which is the earlier one."""
+        first, last = self.index(first_ns), self.index(last_ns)
+        ways = self.ways(np.full(last - first, first), first)
+        return Way(*(each[-1] for each in ways))
+
+
+def bent(
+    T_world_frames: FloatArray,
+    T_world_end: FloatArray,
+    T_world_moved: FloatArray,
+    shares: FloatArray,
+) -> FloatArray:
+    """Return frames (n, 4, 4) that take so large a share (n,) of a move of what they lead to."""
+    T_frames_end = se3.invert(T_world_frames) @ T_world_end
+    move = se3.log(se3.invert(T_world_end) @ T_world_moved)
+    moves = (se3.adjoint(T_frames_end) @ move[..., np.newaxis])[..., 0]
+    return np.asarray(T_world_frames @ se3.exp(shares[:, np.newaxis] * moves))
+
+
+def _drifts(T: FloatArray) -> FloatArray:
+    """Return the covariances of the drift of each step between poses (n, 4, 4)."""
+    lengths = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
+    sigmas = lengths[:, np.newaxis] * np.repeat([_TURN_PER_M, _DRIFT], 3)
+    return np.asarray(sigmas[:, :, np.newaxis] ** 2 * np.eye(6))
