@@ -25,8 +25,8 @@ from gvo.errors import SmoothingError
 from gvo.geometry import se3
 from gvo.geometry.edges import chi2, fuse, inverse, then
 from gvo.odometry.parts import Parts
-from gvo.odometry.path import Path, Way, bent, source_ns
-from gvo.types import Edge, Estimate, FloatArray, IntArray, Loop, Optimum, PosePrior
+from gvo.odometry.path import Path, Way, Ways, bent, source_ns
+from gvo.types import Edge, Estimate, FloatArray, Loop, Optimum, PosePrior
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -129,16 +129,14 @@ class RunGraph:
         """Take over better poses of frames, such as those that the window has smoothed."""
         self.path.update(estimates)
 
-    def way(self, first_ns: int, last_ns: int) -> Way | None:
-        """Return what odometry says of the way between two frames; None if one is not known."""
-        first_ns, last_ns = sorted((first_ns, last_ns))
-        is_known = first_ns in self.path and last_ns in self.path
-        return self.path.way(first_ns, last_ns) if is_known else None
-
     def allows(self, loop: Loop) -> bool:
         """Tell whether a loop leads where odometry, and what was guessed in the dark, allow it."""
-        way = self.way(loop.reference_ns, loop.stamp_ns)
-        return way is None or chi2(loop.edge, way.T, way.covariance + way.drift) <= _FAR_CHI2
+        if not self._is_known(loop):
+            return True
+        return _is_allowed(loop, self.path.way(loop.reference_ns, loop.stamp_ns))
+
+    def _is_known(self, loop: Loop) -> bool:
+        return loop.stamp_ns in self.path and loop.reference_ns in self.path
 
     def _guessed(self, estimate: Estimate) -> FloatArray:
         """Return the covariance of the step to a frame that nothing measures."""
@@ -227,7 +225,7 @@ class RunGraph:
             self._running = None
         if self._running is None and self._is_due and self._n_keyframes >= self._next:
             self._is_due = False
-            chain = self._chain(self.loops)
+            chain = self._chain(self.loops, self.path.ways())
             self._due = self._n_keyframes + _N_LATER
             self._next = self._n_keyframes + max(_N_APART, int(_SHARE_APART * len(chain.ends_ns)))
             pool = ThreadPoolExecutor(1)
@@ -241,27 +239,27 @@ class RunGraph:
         else:
             _LOGGER.warning("the map is not corrected while the run goes: %s", error)
 
-    def _chain(self, loops: Iterable[Loop]) -> _Chain:
+    def _chain(self, loops: Iterable[Loop], ways: Ways) -> _Chain:
         """Return the ends of the confirmed loops that odometry alone allows, as it joins them."""
-        possible = [x for x in loops if x.stamp_ns in self.path and x.reference_ns in self.path]
-        allowed = {id(loop) for loop in possible if not loop.reason and self.allows(loop)}
-        kept = [loop for loop in possible if id(loop) in allowed]
+        allowed, too_far = list[Loop](), list[Loop]()
+        for loop in loops:
+            if not loop.reason and self._is_known(loop):
+                is_allowed = _is_allowed(loop, self._way_of(loop, ways))
+                (allowed if is_allowed else too_far).append(loop)
         ends_ns = {self.path.stamps_ns[0], self.path.stamps_ns[-1]}
-        ends_ns.update(*((loop.reference_ns, loop.stamp_ns) for loop in kept))
+        ends_ns.update(*((loop.reference_ns, loop.stamp_ns) for loop in allowed))
         ends = np.array([self.path.index(ns) for ns in sorted(ends_ns)])
         return _Chain(
             ends_ns=sorted(ends_ns),
             T_world_ends=np.array(self.path.poses[ends]),
-            ways=self._ways_from(ends, ends[1:]),
-            loops=kept,
-            too_far=[x for x in possible if not x.reason and id(x) not in allowed],
+            ways=ways.between(ends[:-1], ends[1:]),
+            loops=allowed,
+            too_far=too_far,
         )
 
-    def _ways_from(self, starts: IntArray, frames: IntArray) -> Way:
-        """Return the ways to some frames, each from the latest of the starts before it."""
-        before = np.searchsorted(starts, np.arange(1, len(self.path)))
-        ways = self.path.ways(starts[before - 1])
-        return Way(*(each[frames - 1] for each in ways))
+    def _way_of(self, loop: Loop, ways: Ways) -> Way:
+        first, last = (self.path.index(ns) for ns in (loop.reference_ns, loop.stamp_ns))
+        return ways.between(np.array(first), np.array(last))
 
     def optimize(self) -> Optimum:
         """Return the poses that fit all measurements best, loops that contradict the rest apart.
@@ -276,7 +274,8 @@ class RunGraph:
         """
         if len(self.path) == 0:
             raise SmoothingError("the graph of the run is empty: no frame has come (loops.enabled)")
-        reasons = self._reasons(self.loops)
+        ways = self.path.ways()
+        reasons = self._reasons(self.loops, ways)
         loops = tuple(
             replace(each, reason=each.reason or reasons.get(_ends(each), "")) for each in self.loops
         )
@@ -290,8 +289,8 @@ class RunGraph:
             raise SmoothingError(f"a frame has no valid edge: {graph.rejected[0]}")
         error_before = optimizer.error
         optimizer.run()
-        factor = self._variance_factor(counted)
-        placed = self._place(frames_ns, optimizer.poses(), factor * optimizer.covariances())
+        covariances = self._variance_factor(counted, ways) * optimizer.covariances()
+        placed = self._place(frames_ns, optimizer.poses(), covariances, ways)
         return replace(
             self._optimum(placed, loops),
             error_before=error_before,
@@ -315,9 +314,9 @@ class RunGraph:
             ),
         )
 
-    def _reasons(self, loops: Sequence[Loop]) -> dict[tuple[int, int], str]:
+    def _reasons(self, loops: Sequence[Loop], ways: Ways) -> dict[tuple[int, int], str]:
         """Return why confirmed loops between two frames do not count."""
-        chain = self._chain(loops)
+        chain = self._chain(loops, ways)
         refused = {_ends(loop) for loop in chain.too_far}
         reasons = dict.fromkeys(refused, _TOO_FAR)
         reasons |= dict.fromkeys(chain.judge().refused, _CONTRADICTS)
@@ -351,7 +350,7 @@ class RunGraph:
                 parts.join(before_ns, frame_ns)
         return graph
 
-    def _variance_factor(self, loops: Sequence[Loop]) -> float:
+    def _variance_factor(self, loops: Sequence[Loop], ways: Ways) -> float:
         """Return how much more odometry drifts than its covariances say, 1 at least.
 
         The median over the loops of what each contradicts it by, unless that may be chance.
@@ -359,13 +358,13 @@ class RunGraph:
         ratios = []
         for loop in loops:
             if self.parts.of(loop.stamp_ns) == self.parts.of(loop.reference_ns):
-                way = self.path.way(loop.reference_ns, loop.stamp_ns)
+                way = self._way_of(loop, ways)
                 ratios.append(chi2(loop.edge, way.T, way.covariance) / 6.0)
         factor = float(np.median(ratios)) if ratios else 1.0
         return factor if factor > INLIER_CHI2 / 6.0 else 1.0
 
     def _place(
-        self, frames_ns: Sequence[int], poses: FloatArray, covariances: FloatArray
+        self, frames_ns: Sequence[int], poses: FloatArray, covariances: FloatArray, ways: Ways
     ) -> tuple[Estimate, ...]:
         """Return all frames; those that are not in the graph hang on those that are.
 
@@ -378,13 +377,13 @@ class RunGraph:
         T[known], C[known] = poses, covariances
         before = np.searchsorted(known, others) - 1
         after = np.minimum(before + 1, len(known) - 1)
-        ways = self._ways_from(known, others)
-        placed = poses[before] @ ways.T
+        way = ways.between(known[before], others)
+        placed = poses[before] @ way.T
         ends = placed @ se3.invert(path.poses[others]) @ path.poses[known[after]]
         shares = path.shares(others, known[before], known[after])
         T[others] = bent(placed, ends, poses[after], shares)
-        rest = (1.0 - shares)[:, np.newaxis, np.newaxis] * ways.covariance
-        C[others] = se3.compose_covariance(covariances[before], ways.T, rest)
+        rest = (1.0 - shares)[:, np.newaxis, np.newaxis] * way.covariance
+        C[others] = se3.compose_covariance(covariances[before], way.T, rest)
         return path.estimates(T, C)
 
 
@@ -425,6 +424,10 @@ class _Chain(NamedTuple):
         optimizer.run()
         refused = {(self.ends_ns[a], self.ends_ns[b]) for a, b, _ in optimizer.refused}
         return _Verdict(refused, optimizer.poses()[-1] @ se3.invert(self.T_world_ends[-1]))
+
+
+def _is_allowed(loop: Loop, way: Way) -> bool:
+    return chi2(loop.edge, way.T, way.covariance + way.drift) <= _FAR_CHI2
 
 
 def _edge(reference_ns: int, T: FloatArray, covariance: FloatArray) -> Edge:

@@ -226,8 +226,7 @@ class Odometry:
     def optimize(self) -> Optimum:
         """Return the poses of all frames so far that fit all that was measured best.
 
-        Loops are closed; without any, it is the batch optimum of the same edges that the window
-        has smoothed.
+        Loops are closed; without any that counts, they are the smoothed poses.
 
         Raises
         ------

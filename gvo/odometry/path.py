@@ -144,34 +144,48 @@ class Path:
             for stamp_ns, status, T, covariance in columns
         )
 
-    def ways(self, starts: IntArray, first: int = 0) -> Way:
-        """Return the ways to all frames after the first one, each from an earlier frame.
-
-        Parameters
-        ----------
-        starts : ndarray of int64, shape (n,)
-            Numbers of the frames that the ways to frames `first + 1`, `first + 2`, ... start from;
-            they do not decrease.
-        first : int
-            The number of the first frame.
-        """
-        rows, since = self._rows[first : first + 1 + len(starts)], starts - first
-        T = se3.invert(rows["T"][since]) @ rows["T"][1:]
-        Ad, back = se3.adjoint(T), se3.adjoint(se3.invert(T))
-        found = []
-        for steps in (rows["step"][1:], _drifts(rows["T"])):
-            total = np.zeros((len(rows), 6, 6))
-            np.cumsum(Ad @ steps @ np.swapaxes(Ad, 1, 2), axis=0, out=total[1:])
-            found.append(back @ (total[1:] - total[since]) @ np.swapaxes(back, 1, 2))
-        # each step drifts alike: the sigmas add up
-        n_steps = np.arange(1, len(rows)) - since
-        return Way(T, found[0], n_steps[:, np.newaxis, np.newaxis] * found[1])
+    def ways(self, first: int = 0, last: int | None = None) -> Ways:
+        """Return the ways between all frames, or those from a first to a last one, as they are."""
+        rows = self._rows[first : len(self) if last is None else last + 1]
+        return Ways(se3.invert(rows["T"][0]) @ rows["T"], rows["step"])
 
     def way(self, first_ns: int, last_ns: int) -> Way:
         """Return the way between two frames, the first of which is the earlier one."""
         first, last = self.index(first_ns), self.index(last_ns)
-        ways = self.ways(np.full(last - first, first), first)
-        return Way(*(each[-1] for each in ways))
+        return self.ways(first, last).between(np.array(0), np.array(last - first))
+
+
+class Ways:
+    """The ways between frames, which are numbered from 0.
+
+    Parameters
+    ----------
+    T : ndarray of float64, shape (n, 4, 4)
+        Poses of the frames in the first one.
+    steps : ndarray of float64, shape (n, 6, 6)
+        Covariances of the steps that lead to them.
+    """
+
+    def __init__(self, T: FloatArray, steps: FloatArray) -> None:
+        self._T = T
+        # Summed up in the axes of the first frame.
+        Ad = se3.adjoint(T)
+        lengths = np.linalg.norm(np.diff(T[:, :3, 3], axis=0, prepend=T[:1, :3, 3]), axis=1)
+        sigmas = lengths[:, np.newaxis] * np.repeat([_TURN_PER_M, _DRIFT], 3)
+        drifts = (Ad * sigmas[:, np.newaxis] ** 2) @ np.swapaxes(Ad, 1, 2)
+        self._covariances = np.cumsum(Ad @ steps @ np.swapaxes(Ad, 1, 2), axis=0)
+        self._drifts = np.cumsum(drifts, axis=0)
+
+    def between(self, first: IntArray, last: IntArray) -> Way:
+        """Return the ways (...) from frames to later ones, given by their numbers (...)."""
+        T = se3.invert(self._T[first]) @ self._T[last]
+        T_last = se3.invert(self._T[last])
+        covariance, drift = (
+            se3.transport_covariance(total[last] - total[first], T_last)
+            for total in (self._covariances, self._drifts)
+        )
+        # each step drifts alike: the sigmas add up
+        return Way(T, covariance, (last - first)[..., np.newaxis, np.newaxis] * drift)
 
 
 def bent(
@@ -185,10 +199,3 @@ def bent(
     move = se3.log(se3.invert(T_world_end) @ T_world_moved)
     moves = (se3.adjoint(T_frames_end) @ move[..., np.newaxis])[..., 0]
     return np.asarray(T_world_frames @ se3.exp(shares[:, np.newaxis] * moves))
-
-
-def _drifts(T: FloatArray) -> FloatArray:
-    """Return the covariances of the drift of each step between poses (n, 4, 4)."""
-    lengths = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
-    sigmas = lengths[:, np.newaxis] * np.repeat([_TURN_PER_M, _DRIFT], 3)
-    return np.asarray(sigmas[:, :, np.newaxis] ** 2 * np.eye(6))

@@ -88,8 +88,6 @@ def styles_of(names: Iterable[str]) -> list[Style]:
     styles = []
     for name in names:
         word = next((w for w in re.findall("[a-z]+", name.lower()) if w in left), None)
-        # where it lies on the smoothed one, without loops, both are to be seen
-        known = "-." if word == "global" else "-"
-        linestyle, color = (known, left.pop(word)) if word else next(free)
+        linestyle, color = ("-", left.pop(word)) if word else next(free)
         styles.append(Style(color=color, linestyle=linestyle))
     return styles

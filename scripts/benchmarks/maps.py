@@ -20,7 +20,7 @@ from gvo.frontend.klt import KltPlace
 from gvo.geometry import se3
 from gvo.odometry.graph import RunGraph
 from gvo.odometry.loops import LoopDetector
-from gvo.types import Edge, Estimate, Failure, FloatArray
+from gvo.types import Edge, Estimate, Failure, FloatArray, Loop
 
 from .recordings import at_least
 
@@ -49,15 +49,16 @@ def measure(arguments: argparse.Namespace) -> None:
     errors = np.array([each.T_world_frame[:3, 3] for each in optimum.estimates])
     errors -= stream.truth[:, :3, 3]
     n_loops = sum(not loop.reason for loop in optimum.loops)
-    print(f"frames {n_frames}, keyframes {len(stream.graph)}, places {len(stream.detector)}")
+    n_kept, n_places = len(stream.graph), len(stream.detector)
+    print(f"frames {n_frames}, of which in the graph {n_kept}, places {n_places}")
     print(f"loops {n_loops}, errors {np.sqrt(np.mean(np.sum(errors**2, axis=1))):.3f} m")
     for name, spent in stream.spent_s.items():
         print(f"{name}: {1e3 * spent / n_frames:.2f} ms CPU per frame")
     print(f"end of the run: {seconds:.2f} s CPU, with covariances", flush=True)
-    measure_memory(n_frames, n_keyframes=len(stream.graph))
+    measure_memory(n_frames)
 
 
-def measure_memory(n_frames: int, *, n_keyframes: int) -> None:
+def measure_memory(n_frames: int) -> None:
     """Print what tracemalloc counts of places and of the graph."""
     tracemalloc.start()
     stream = Stream(n_frames)
@@ -69,10 +70,7 @@ def measure_memory(n_frames: int, *, n_keyframes: int) -> None:
     stream.run(is_detector=False)
     graph = tracemalloc.get_traced_memory()[0] - before
     tracemalloc.stop()
-    print(
-        f"memory per keyframe: {1e-3 * (places + graph) / n_keyframes:.1f} kB, of which graph "
-        f"{1e-3 * graph / n_keyframes:.1f} kB with {EVERY - 1} frames"
-    )
+    print(f"memory: graph {1e-6 * graph:.1f} MB, places {1e-6 * places:.1f} MB")
 
 
 @dataclass(frozen=True)
@@ -136,7 +134,8 @@ class Stream:
         self.rng = np.random.default_rng(0)
         self.graph = RunGraph(Config().window)
         self.frontend = Frontend(self.truth, n_lap, self.rng)
-        self.detector = LoopDetector(frontend=self.frontend)
+        self.detector = LoopDetector(frontend=self.frontend, graph=self.graph)
+        self.graph.loops = self.detector.loops
         self.spent_s = {"graph": 0.0, "loops": 0.0, "optimization on the way": 0.0}
 
     def run(self, *, is_graph: bool = True, is_detector: bool = True) -> None:
@@ -149,28 +148,30 @@ class Stream:
             steps = [edge for edge in edges if edge.reference_id == (j - 1) * PERIOD_NS]
             T = T @ steps[0].T_reference_frame if steps else T
             estimate = Estimate(stamp_ns=j * PERIOD_NS, T_world_frame=T, covariance=np.eye(6))
-            start = time.process_time()
+            is_keyframe = j % EVERY == 0
+            loops = self._look(j, T, kept[-20:]) if is_keyframe and is_detector else ()
             if is_graph:
-                self.graph.add_frame(estimate, edges, is_keyframe=j % EVERY == 0)
-            self.spent_s["graph"] += time.process_time() - start
-            if j % EVERY == 0:
-                kept.append(j)
-                if is_detector:
-                    self._look(j, T, kept[-20:], is_graph=is_graph)
+                self._add(estimate, edges, is_keyframe=is_keyframe, is_looped=bool(loops))
+            kept += [j] if is_keyframe else []
 
-    def _look(self, j: int, T: FloatArray, kept: list[int], *, is_graph: bool) -> None:
+    def _look(self, j: int, T: FloatArray, kept: list[int]) -> tuple[Loop, ...]:
         seen = self.frontend.extract(j)
-        times = [time.process_time()]
+        start = time.process_time()
         loops = self.detector.look(seen, T, near={k * PERIOD_NS for k in kept})
-        times.append(time.process_time())
-        if is_graph:
-            self.graph.loops = self.detector.loops
-            self.graph.advance(loops, self.detector)
-            if self.graph._running is not None:  # by itself, so that its time can be told
-                self.graph._running.exception()
-        times.append(time.process_time())
-        self.spent_s["loops"] += times[1] - times[0]
-        self.spent_s["optimization on the way"] += times[2] - times[1]
+        self.spent_s["loops"] += time.process_time() - start
+        return loops
+
+    def _add(
+        self, estimate: Estimate, edges: list[Edge], *, is_keyframe: bool, is_looped: bool
+    ) -> None:
+        start = time.process_time()
+        is_place = estimate.stamp_ns in self.detector
+        self.graph.add_frame(estimate, edges, is_place=is_place)
+        self.spent_s["graph"] += time.process_time() - start
+        start = time.process_time()
+        if is_keyframe:
+            self.graph.advance(is_looped=is_looped)
+        self.spent_s["optimization on the way"] += time.process_time() - start
 
 
 def around_the_block(n_frames: int, n_lap: int) -> FloatArray:

@@ -39,7 +39,7 @@ def optimum_of(estimates: Iterable[Estimate], *loops: Loop) -> Optimum:
     """Return global poses, and what became of the loops."""
     return Optimum(
         estimates=tuple(estimates),
-        keyframes_ns=(),
+        frames_ns=(),
         edges=(),
         loops=loops,
         residuals=np.zeros(len(loops)),

@@ -23,6 +23,7 @@ from gvo.io.run_folder.writer import (
     TRUE_POSITIONS,
     TRUTH,
 )
+from gvo.trajectory.evaluation import SMOOTHED_GLOBAL
 from gvo.trajectory.formats import MAX_LINES, MAX_POSITION_M, read_covariances, read_trajectory
 from gvo.trajectory.trajectory import StampsFrom, Trajectory
 from gvo.types import FloatArray
@@ -92,8 +93,15 @@ class RunRecord:
         return bool(self.summary) and self.summary.get("state", "complete") == "complete"
 
     def comparable(self) -> dict[str, Trajectory]:
-        """Return the trajectories that hold poses, moved to the point that the truth is of."""
+        """Return the trajectories that hold poses, moved to the point that the truth is of.
+
+        Without a loop the global one equals the smoothed one, and both are one.
+        """
         filled = {name: t for name, t in self.trajectories.items() if len(t) > 0}
+        smoothed, best = filled.get("smoothed"), filled.get(GLOBAL)
+        if smoothed and best and np.array_equal(smoothed.T_world_frame, best.T_world_frame):
+            del filled["smoothed"], filled[GLOBAL]
+            filled[SMOOTHED_GLOBAL] = best
         T_base_truth = self.summary.get("T_base_truth")
         if self.truth is None or T_base_truth is None:
             return filled

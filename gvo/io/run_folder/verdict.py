@@ -74,7 +74,7 @@ def loop_words(summary: Mapping[str, Any]) -> str:
     if refused:
         reasons = ", ".join(f"{count}: {reason}" for reason, count in refused.items())
         words += f", {sum(refused.values())} refused ({reasons})"
-    return words if n else f"{words}; global is the batch optimum of the same edges"
+    return words if n else f"{words}; global is smoothed"
 
 
 def _how_sure(summary: Mapping[str, Any]) -> str:

@@ -140,9 +140,10 @@ def write_run_report(
     compared, reason = _compare(record, estimates)
     with style():
         lines, world = _lines(record, estimates, compared)
-        if record.loops and "global" in estimates:
-            shown = {"global": estimates["global"]} | {c.name: c.trajectory for c in compared}
-            lines += loop_lines(loop_ends(record.loops, shown["global"]))
+        shown = estimates | {c.name: c.trajectory for c in compared}
+        if record.loops:
+            best = (trajectory for name, trajectory in shown.items() if "global" in name)
+            lines += [line for each in best for line in loop_lines(loop_ends(record.loops, each))]
         drawn = [
             *_path_plots(lines, world),
             *_truth_plots(record, compared, reason),

@@ -122,7 +122,7 @@ def test_the_verdict_says_how_far_and_how_good(told: dict[str, Any], words: str)
     assert verdict(json.loads(json.dumps(told))) == words
 
 
-SAME = "global is the batch optimum of the same edges"
+SAME = "global is smoothed"
 
 
 @pytest.mark.parametrize(

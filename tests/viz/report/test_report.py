@@ -103,7 +103,7 @@ def write_loops(folder: Path, n: int, *, reason: str) -> None:
 
 
 def test_loops_are_counted_drawn_and_listed(copy: Path, page: Path) -> None:
-    assert "no loop found; global is the batch optimum of the same edges." in page.read_text()
+    assert "no loop found; global is smoothed." in page.read_text()
     assert "Thin lines" not in page.read_text()
     assert "loops" not in Page(page.read_text()).ids
     write_loops(copy, 90, reason="odd & <b>")
