@@ -10,7 +10,9 @@ degrees, and unlikely where it is off by more than 5 sigma of its covariance.
 of a lens in the sun, which no calibration tells: a lap of 40 s then does not close by some P % of
 its length, and nothing in the covariances says so. `--dark A-B` blackens the images from A to B
 seconds after the first. Errors are then those of the frames that are tracked in the dark
-recording, beside the global ones of the unbroken one.
+recording, beside the global ones of the unbroken one. Besides, of the frame half a second after the
+light: how much of what the last frame before the dark saw is in its view, and how far it is off
+relative to that frame, in the dark run and in the unbroken one.
 
 Example: python scripts/benchmark.py loops --seeds 10 --kind block --drift 1 --keep rendered
 Example: python scripts/benchmark.py loops --dark 1-2 rgbd_dataset_freiburg1_rpy_part
@@ -25,8 +27,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 import gvo
+from gvo.frontend.descriptor import as_stereo
 from gvo.geometry import se3
 from gvo.io.recording import Source
+from gvo.odometry.keyframes import view_overlap
 from gvo.runs.statistics import RunStatistics
 from gvo.testing.faults import Black, FaultyImage, FaultySource, PixelFault, Pixels
 from gvo.trajectory.alignment import associate
@@ -55,7 +59,18 @@ HEADER = (
     "wrong",
     "> 5 sigma",
 )
-UNBROKEN_HEADER = ("segments", "ATE unbroken [m]", "global / unbroken")
+UNBROKEN_HEADER = (
+    "segments",
+    "ATE unbroken [m]",
+    "global / unbroken",
+    "in view again",
+    "then causal [m]",
+    "unbroken",
+    "then smoothed [m]",
+    "unbroken",
+)
+UNBROKEN_DIGITS = (0, 4, 2, 2, 4, 4, 4, 4)
+AFTER_DARK_S = 0.5
 N_FIGURES = len(HEADER) + 1  # two columns hold two, and the name is none
 
 
@@ -141,18 +156,50 @@ def judge(source: Source, config: gvo.Config, arguments: argparse.Namespace) -> 
     run = track(darkened(bright, arguments.dark) if arguments.dark else bright, config)
     tied_ns = [r.stamp_ns for r in run.results if r.status in (Status.OK, Status.RESUMED)]
     optimum = run.odometry.optimize()
-    smoothed, best = run.trajectories()["smoothed"], gvo.Trajectory.of(optimum.estimates)
-    estimates = [each.select(np.isin(each.stamps_ns, tied_ns)) for each in (smoothed, best)]
+    found = run.trajectories() | {"global": gvo.Trajectory.of(optimum.estimates)}
+    both = found["smoothed"], found["global"]
+    estimates = [each.select(np.isin(each.stamps_ns, tied_ns)) for each in both]
     if min(map(len, estimates)) < MIN_TRACKED:
         return [np.nan] * (N_FIGURES + (len(UNBROKEN_HEADER) if arguments.dark else 0))
     ates = [gvo.evaluate(truth, estimate, name="").ate_m for estimate in estimates]
     figures = [*ates, ates[1] / ates[0], *of_visits(truth, estimates)]
     figures += of_loops(truth, optimum.loops)
     if arguments.dark:
-        unbroken = gvo.Trajectory.of(track(bright, config).odometry.optimize().estimates)
-        estimate = unbroken.select(np.isin(unbroken.stamps_ns, tied_ns))
+        unbroken = track(bright, config)
+        whole = unbroken.trajectories()
+        whole["global"] = gvo.Trajectory.of(unbroken.odometry.optimize().estimates)
+        estimate = whole["global"].select(np.isin(whole["global"].stamps_ns, tied_ns))
         ate = gvo.evaluate(truth, estimate, name="").ate_m
         figures += [n_segments(run.results), ate, ates[1] / ate]
+        figures += after_dark(truth, source, unbroken, (found, whole), arguments.dark)
+    return figures
+
+
+def after_dark(
+    truth: gvo.Trajectory,
+    source: Source,
+    unbroken: recordings.Run,
+    runs: Sequence[dict[str, gvo.Trajectory]],
+    dark_s: tuple[float, float],
+) -> list[float]:
+    """Return what is in view again after the dark, and how far causal and smoothed are off then."""
+    stamps_ns = np.array([result.stamp_ns for result in unbroken.results])
+    since_s = 1e-9 * (stamps_ns - stamps_ns[0])
+    before, after = np.searchsorted(since_s, (dark_s[0], dark_s[1] + AFTER_DARK_S)) - (1, 0)
+    if after >= len(stamps_ns):
+        return [np.nan] * 5
+    ends_ns = stamps_ns[[before, after]]
+    known, seen = truth.interpolate(ends_ns), unbroken.results[before].registration
+    if len(known) < 2 or seen is None:
+        return [np.nan] * 5
+    T = se3.invert(known.T_world_frame[1]) @ known.T_world_frame[0]
+    camera = as_stereo(source.info.camera)
+    figures = [view_overlap(seen.points_current[seen.inliers], T, camera)]
+    for name in ("causal", "smoothed"):
+        for trajectories in runs:
+            ends = trajectories[name].select(np.isin(trajectories[name].stamps_ns, ends_ns))
+            T_ends = se3.invert(ends.T_world_frame[0]) @ ends.T_world_frame[1]
+            figures.append(float(lengths(T @ T_ends)))
     return figures
 
 
@@ -247,5 +294,5 @@ def cells(name: str, figures: Sequence[float]) -> list[str]:
         f"{number(global_m, 4)}, {number(global_deg, 3)}",
         number(figures[8], 2),
         *(number(value, 0) for value in figures[9:14]),
-        *(number(value, n) for value, n in zip(figures[14:], (0, 4, 2), strict=False)),
+        *(number(value, n) for value, n in zip(figures[14:], UNBROKEN_DIGITS, strict=False)),
     ]
