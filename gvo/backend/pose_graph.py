@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
 from typing import Any, TypeAlias
 
 import gtsam
@@ -186,8 +185,7 @@ class PoseGraph:
         """Repeat the last update until poses converge, if it moved them far.
 
         One step of Gauss-Newton is exact only for motions by a fraction of a radian; closing a
-        loop takes a few. If a part of the graph turned far, its marginals are turned with it,
-        unless that fits worse. A whole graph is left to the batch optimization at its end.
+        loop takes a few. A whole graph is left to the batch optimization at its end.
 
         Parameters
         ----------
@@ -208,21 +206,11 @@ class PoseGraph:
         poses = {**before, **starts}
         if _converged(poses, self.poses3(poses), _FAR):
             return False
-        after = self._settle(poses, alive, leaving)
-        turns = [after[key].compose(pose.inverse()) for key, pose in before.items()]
-        turn = max(turns, key=_angle, default=gtsam.Pose3())
-        if _angle(turn) > _FAR:
-            former, error = self._isam, self.error()
-            self._update_turned(turn, alive, leaving)
-            self._settle(poses, alive, leaving)
-            if not self.error() < error:
-                self._isam = former
+        self._settle(poses, alive, leaving)
         return True
 
-    def _settle(
-        self, keys: Iterable[int], alive: Collection[int], leaving: Sequence[int]
-    ) -> dict[int, gtsam.Pose3]:
-        """Repeat the last update until poses converge; return them."""
+    def _settle(self, keys: Iterable[int], alive: Collection[int], leaving: Sequence[int]) -> None:
+        """Repeat the last update until poses converge."""
         after = self.poses3(keys)
         for _ in range(_MAX_STEPS):
             nothing, before = (gtsam.NonlinearFactorGraph(), gtsam.Values()), after
@@ -230,39 +218,6 @@ class PoseGraph:
             after = self.poses3(keys)
             if _converged(before, after, _STILL):
                 break
-        return after
-
-    def _update_turned(
-        self, turn: gtsam.Pose3, alive: Collection[int], leaving: Sequence[int]
-    ) -> None:
-        """Turn the marginals of poses that left with the part of the graph that turned.
-
-        iSAM2 does not linearize the poses of a marginal again, and a step of Gauss-Newton from
-        afar is wrong. What a marginal says of its poses is the same wherever they are as a whole:
-        if a part of the graph turned, as when a loop ties it to the rest, the marginal is linear
-        about the turned poses as it was about those before.
-
-        Parameters
-        ----------
-        turn : gtsam.Pose3
-            T_new_old in the world.
-        alive, leaving
-            As for the update.
-        """
-        points, values = self._isam.getLinearizationPoint(), self.values()
-        factors = gtsam.NonlinearFactorGraph()
-        for factor in map(self.factors().at, range(self.factors().size())):
-            if isinstance(factor, gtsam.LinearContainerFactor):
-                turned = gtsam.Values()
-                for key in factor.keys():  # noqa: SIM118 - not a dict
-                    point = points.atPose3(key)
-                    candidates = [point, turn.compose(point)]
-                    turned.insert(key, min(candidates, key=partial(_distance, values.atPose3(key))))
-                factors.add(gtsam.LinearContainerFactor(factor.linearize(turned), turned))
-            elif factor is not None:
-                factors.add(factor)
-        self._isam, self._n_poses, self._saved = gtsam.ISAM2(self._isam.params()), 0, None
-        self.update(factors, values, alive=alive, leaving=leaving)
 
     def marginalize(self, keys: Sequence[int]) -> None:
         """Marginalize poses that the last update made leaves."""
@@ -301,10 +256,6 @@ class PoseGraph:
         """Return all factors, marginals among them."""
         return self._isam.getFactorsUnsafe()
 
-    def error(self) -> float:
-        """Return half the sum of the squared whitened residuals."""
-        return float(self.factors().error(self.values()))
-
     def values(self) -> gtsam.Values:
         """Return all poses."""
         return self._isam.calculateEstimate()
@@ -320,14 +271,6 @@ def _converged(
         return True
     moves = [before[key].localCoordinates(after[key]).tolist() for key in before]
     return bool(max(max(map(abs, move)) for move in moves) < limit)
-
-
-def _angle(T: gtsam.Pose3) -> float:
-    return float(T.rotation().axisAngle()[1])
-
-
-def _distance(first: gtsam.Pose3, second: gtsam.Pose3) -> float:
-    return float(np.linalg.norm(first.localCoordinates(second)))
 
 
 def first_line(error: BaseException) -> str:

@@ -13,7 +13,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvo.backend.pose_graph import PoseGraph
 from gvo.backend.window import SlidingWindow
 from gvo.config import WindowConfig
 from gvo.geometry import se3
@@ -752,79 +751,6 @@ def test_a_pose_that_closes_a_large_turn_settles_with_others(turn_rad: float, si
     np.testing.assert_allclose(answer.T_world_frame, optimum.atPose3(N).matrix(), atol=2e-4)
     for frame, T in enumerate(window.poses().values()):
         np.testing.assert_allclose(T, optimum.atPose3(frame).matrix(), atol=1e-3)
-
-
-@pytest.mark.parametrize("is_late", [False, True])
-@pytest.mark.parametrize("turn_rad", [0.4, -1.2])
-def test_what_hung_on_a_guess_is_turned_as_a_whole(turn_rad: float, is_late: bool) -> None:
-    n_before, sigma, rng = 10, 1e-3, np.random.default_rng(7)
-    poses = wander(rng, 90)
-    edges = [
-        [each for each in found if (number(each.reference_id) < n_before) == (frame < n_before)]
-        for frame, found in enumerate(net(poses, rng, sigma, n_back=4))
-    ]
-    T_guess = se3.exp(np.array([0.0, turn_rad, 0.1, 9.0, 1.0, 20.0]))
-    sigmas = np.array([1.0] * 3 + [10.0] * 3)
-    edges[n_before] = [
-        Edge(reference_id=9, T_reference_frame=T_guess, covariance=np.diag(sigmas**2))
-    ]
-    loop = measure(poses, 4, 60, rng, sigma)
-    window = SlidingWindow(WindowConfig(size=5, kernel="none"))
-    for frame, found in enumerate(edges):
-        is_joining = frame == 60
-        loops = [loop] if is_joining and not is_late else []
-        assert window.add_pose(frame, frame * STEP_NS, [*found, *loops]).rejected == ()
-        if is_joining and is_late:
-            assert window.add_edge(frame, loop)
-        if frame < n_before or (30 < frame < 60 and frame % 2):
-            window.keep(frame)
-        for kept in window.kept()[n_before:] if frame == 61 else window.kept()[: frame > 70]:
-            window.release(kept)
-        if frame >= 60:
-            held = {each: T for each, T in window.poses().items() if number(each) >= n_before}
-            true = np.array([poses[number(each)] for each in held])
-            step, true_step = (
-                se3.invert(T[:-1]) @ T[1:] for T in (np.array([*held.values()]), true)
-            )
-            np.testing.assert_allclose(step, true_step, atol=4.0 * sigma)
-
-
-def test_a_part_is_turned_only_where_that_fits_better(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What hangs on a guess is tied again and again to what was before, by other motions."""
-    turn, iterate = PoseGraph._update_turned, PoseGraph.iterate
-    settled: list[float] = []
-    turned: list[tuple[float, float]] = []
-
-    def update_turned(graph: PoseGraph, *arguments: Any) -> None:
-        settled.append(graph.error())
-        turn(graph, *arguments)
-
-    def iterate_noted(graph: PoseGraph, *arguments: Any, **options: Any) -> bool:
-        settled.clear()
-        is_far = iterate(graph, *arguments, **options)
-        turned.extend((error, graph.error()) for error in settled)
-        return is_far
-
-    monkeypatch.setattr(PoseGraph, "_update_turned", update_turned)
-    monkeypatch.setattr(PoseGraph, "iterate", iterate_noted)
-    n_before, rng = 10, np.random.default_rng(0)
-    poses = wander(rng, 100)
-    window = SlidingWindow(WindowConfig(size=5))
-    for frame, found in enumerate(net(poses, rng, 1e-3, n_back=4)):
-        edges = [
-            each for each in found if (number(each.reference_id) < n_before) == (frame < n_before)
-        ]
-        if frame == n_before:
-            edges = [edge(n_before - 1, se3.exp(np.array([0.0, 1.0, 0.1, 9.0, 1.0, 20.0])), 3.0)]
-        if frame >= 60:
-            loop = measure(poses, int(rng.integers(n_before)), frame, rng, 0.3)
-            edges.append(loop)
-        window.add_pose(frame, frame * STEP_NS, edges)
-        if frame < n_before or frame % 5 == 0:
-            window.keep(frame)
-    assert any(after < before for before, after in turned)
-    assert all(after <= before for before, after in turned)
-    assert any(after == before for before, after in turned)
 
 
 # Sigmas many orders of magnitude apart: Cholesky calls the system indeterminate, QR solves it.
