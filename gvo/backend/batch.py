@@ -23,8 +23,16 @@ import numpy as np
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
-from gvo.backend.factors import ORIGIN, Factors, Measurement, find_faults, place_fault, prior_fault
-from gvo.backend.pose_graph import definite, first_line
+from gvo.backend.factors import (
+    ORIGIN,
+    Factors,
+    Measurement,
+    definite,
+    find_faults,
+    first_line,
+    place_fault,
+    prior_fault,
+)
 from gvo.config import WindowConfig
 from gvo.errors import SmoothingError
 from gvo.geometry import se3

@@ -15,7 +15,7 @@ import numpy as np
 
 from gvo.config import Kernel, WindowConfig
 from gvo.geometry import se3
-from gvo.types import Edge, FloatArray, FrameId, GraphEdge, PosePrior, PositionPrior, Prior
+from gvo.types import Edge, FloatArray, PosePrior, PositionPrior, Prior
 
 ORIGIN = PosePrior(T_world_frame=np.eye(4), covariance=1e-10 * np.eye(6))
 """Prior of a first pose without one, which defines the world: radians and metres."""
@@ -24,9 +24,8 @@ ORIGIN = PosePrior(T_world_frame=np.eye(4), covariance=1e-10 * np.eye(6))
 _MAX_COORDINATE_M = 1e8
 _MIN_SIGMA = 1e-8
 _MAX_SIGMA = 1e6
-# Bounds of the sigmas of a replaced covariance.
-_MIN_SANE_SIGMA = 1e-5
-_MAX_SANE_SIGMA = 1e3
+_MIN_EIGENVALUE = 1e-10
+_MAX_ROUNDING = 1e-6
 # A kernel acts on the norm of the whitened 6-vector, typically 2.45: the usual constants, for
 # scalars, would down-weight most inliers. Huber's is the 95 % quantile of chi with six degrees of
 # freedom; the others lose as much asymptotic efficiency as it does, 0.2 %.
@@ -80,13 +79,13 @@ class Factors:
 
     def between(
         self, reference_key: int, key: int, measurement: Measurement
-    ) -> gtsam.NonlinearFactor:
+    ) -> gtsam.NoiseModelFactor:
         """Return the between-factor of an edge."""
         edge, T_reference_frame, gaussian = measurement
         noise = self._robust(gaussian, edge.kernel or self.default)
         return gtsam.BetweenFactorPose3(reference_key, key, T_reference_frame, noise)
 
-    def prior(self, key: int, prior: Prior) -> gtsam.NonlinearFactor:
+    def prior(self, key: int, prior: Prior) -> gtsam.NoiseModelFactor:
         """Return the factor of a prior."""
         gaussian = gtsam.noiseModel.Gaussian.Covariance(prior.covariance)
         noise = self._robust(gaussian, prior.kernel)
@@ -94,63 +93,18 @@ class Factors:
             return gtsam.PriorFactorPose3(key, gtsam.Pose3(prior.T_world_frame), noise)
         return gtsam.GPSFactor(key, prior.position_world, noise)
 
-    def residual_of_edge(
-        self,
-        edge: Edge,
-        frame_id: FrameId,
-        T_world_reference: FloatArray,
-        T_world_frame: FloatArray,
-    ) -> GraphEdge:
-        """Return the whitened residual and the weight of an edge between two poses."""
-        predicted = T_world_reference @ edge.T_reference_frame
-        error = se3.log(se3.invert(predicted) @ T_world_frame)
-        residual = _whiten(error, edge.covariance)
-        return GraphEdge(
-            reference_id=edge.reference_id,
-            frame_id=frame_id,
-            T_reference_frame=edge.T_reference_frame,
-            covariance=edge.covariance,
-            residual=residual,
-            weight=self._weight(residual, edge.kernel or self.default),
-        )
-
-    def residual_of_prior(
-        self, prior: Prior, frame_id: FrameId, T_world_frame: FloatArray
-    ) -> GraphEdge:
-        """Return the whitened residual and the weight of a prior of a pose."""
-        if isinstance(prior, PosePrior):
-            measured = prior.T_world_frame
-            error = se3.log(se3.invert(measured) @ T_world_frame)
-        else:
-            measured = se3.make_transform(T_world_frame[:3, :3], prior.position_world)
-            error = T_world_frame[:3, 3] - prior.position_world
-        residual = _whiten(error, prior.covariance)
-        return GraphEdge(
-            reference_id=None,
-            frame_id=frame_id,
-            T_reference_frame=measured,
-            covariance=prior.covariance,
-            residual=residual,
-            weight=self._weight(residual, prior.kernel),
-        )
-
     def _robust(self, gaussian: gtsam.noiseModel.Gaussian, kernel: Kernel) -> gtsam.noiseModel.Base:
         estimator = self._estimators.get(kernel)
         return (
             gaussian if estimator is None else gtsam.noiseModel.Robust.Create(estimator, gaussian)
         )
 
-    def _weight(self, residual: FloatArray, kernel: Kernel) -> float:
-        norm = float(np.linalg.norm(residual))
-        estimator = self._estimators.get(kernel)
-        return 1.0 if estimator is None else float(estimator.weight(norm))  # type: ignore[attr-defined]
 
-
-def _whiten(error: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return R e, where R is upper triangular and R^T R the inverse of the covariance."""
-    # The Cholesky factor L of the covariance with reversed axes: R = L^-1, reversed.
-    L = np.linalg.cholesky(covariance[::-1, ::-1])
-    return np.asarray(np.linalg.solve(L, error[::-1])[::-1])
+def residual_of(factor: gtsam.NoiseModelFactor, values: gtsam.Values) -> tuple[FloatArray, float]:
+    """Return the whitened residual of a factor at these poses, and the weight of its kernel."""
+    noise = factor.noiseModel()
+    residual = np.asarray(noise.unweightedWhiten(factor.unwhitenedError(values)))
+    return residual, float(noise.weight(residual))
 
 
 def find_faults(edges: Sequence[Edge]) -> list[str]:
@@ -161,33 +115,11 @@ def find_faults(edges: Sequence[Edge]) -> list[str]:
     ]
 
 
-def place_fault(positions_world: FloatArray) -> str:
-    """Say why optimized positions, shape (..., 3), are invalid; empty if they are valid."""
-    return _divergence(float(np.abs(positions_world).max()))
-
-
-def pose_fault(T_world_frame: FloatArray) -> str:
-    """Say why an optimized pose is invalid; empty if it is valid."""
-    rows = T_world_frame.tolist()
-    if not math.isfinite(sum(map(sum, rows))):
-        return "a pose is not finite"
-    (_, _, _, x), (_, _, _, y), (_, _, _, z), _ = rows
-    return _divergence(max(abs(x), abs(y), abs(z)))
-
-
-def _divergence(largest: float) -> str:
+def place_fault(poses: FloatArray) -> str:
+    """Say why optimized poses or positions are invalid; empty if they are valid."""
+    largest = float(np.abs(poses).max())
     is_far = not largest <= 2.0 * _MAX_COORDINATE_M  # NaN too
     return f"a pose diverged to {largest:.3g} m" if is_far else ""
-
-
-def sane_covariance(covariance: FloatArray) -> FloatArray:
-    """Return the covariance; if invalid, a diagonal one of its sigmas within bounds."""
-    if not covariance_fault(covariance):
-        return np.asarray(0.5 * (covariance + covariance.T))
-    variances = np.nan_to_num(
-        np.diag(covariance), nan=_MAX_SANE_SIGMA**2, posinf=_MAX_SANE_SIGMA**2
-    )
-    return np.diag(np.clip(variances, _MIN_SANE_SIGMA**2, _MAX_SANE_SIGMA**2))
 
 
 def prior_fault(prior: Prior) -> str:
@@ -229,3 +161,31 @@ def covariance_fault(covariance: FloatArray) -> str:
         return ""
     wrong = math.sqrt(smallest if smallest < _MIN_SIGMA**2 else largest)
     return f"its sigma {wrong:.3g} is outside {_MIN_SIGMA:.0e} to {_MAX_SIGMA:.0e}"
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of an error message, or the name of its type."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
+
+
+def definite(covariance: FloatArray) -> FloatArray:
+    """Return the covariance, symmetric positive definite in spite of rounding.
+
+    With sigmas many orders of magnitude apart, rounding may leave the smallest eigenvalue of the
+    correlations at or below zero.
+    """
+    symmetric = np.asarray(0.5 * (covariance + covariance.T))
+    if not math.isfinite(np.add.reduce(symmetric, axis=None)):
+        raise RuntimeError("a covariance is not finite")
+    if se3.is_definite(symmetric):
+        return symmetric
+    variances = np.diag(symmetric)
+    if variances.min() <= 0.0:
+        raise RuntimeError("a variance is not positive")
+    # On correlations: sigmas may be many orders of magnitude apart.
+    scale = np.sqrt(np.outer(variances, variances))
+    eigenvalues, vectors = np.linalg.eigh(symmetric / scale)
+    if eigenvalues[0] < -_MAX_ROUNDING:
+        raise RuntimeError("a covariance is not positive definite")
+    repaired = (vectors * np.maximum(eigenvalues, _MIN_EIGENVALUE)) @ vectors.T * scale
+    return np.asarray(0.5 * (repaired + repaired.T))

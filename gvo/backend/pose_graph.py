@@ -1,4 +1,4 @@
-"""A pose graph by integer keys in iSAM2: update, marginalize, restore.
+"""The poses of a window in iSAM2: add, smooth, marginalize, and go back where GTSAM fails.
 
 References
 ----------
@@ -8,53 +8,123 @@ M. Kaess et al., "iSAM2: Incremental smoothing and mapping using the Bayes tree"
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from typing import Any, TypeAlias
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from typing import Any, TypeVar
 
 import gtsam
 import numpy as np
 
+from gvo.backend.batch import BatchResult, optimize_batch
+from gvo.backend.factors import (
+    ORIGIN,
+    Factors,
+    Measurement,
+    definite,
+    first_line,
+    place_fault,
+    residual_of,
+)
+from gvo.config import WindowConfig
 from gvo.errors import SmoothingError
-from gvo.geometry.se3 import is_definite
-from gvo.types import FloatArray
+from gvo.geometry import se3
+from gvo.types import (
+    Edge,
+    Estimate,
+    FloatArray,
+    FrameId,
+    GraphEdge,
+    PosePrior,
+    Prior,
+    Rejected,
+    Status,
+)
 
-# Radians and metres: if an update moves a pose by more than the first, it is repeated until the
-# pose moves by less than the second.
-_FAR = 0.02
-_STILL = 1e-4
+_LOGGER = logging.getLogger(__name__)
+_Result = TypeVar("_Result")
+
+# Radians and metres: poses that an update moves farther than this are linearized again. A step of
+# Gauss-Newton leaves about the square of it, and kernels their weights from before it.
+_FAR = 0.01
 _MAX_STEPS = 10
-# A call since the last copy of the graph, replayed to restore it: the function, its arguments, and
-# the key of a pose whose estimate was asked for afterwards.
-_Step: TypeAlias = tuple[Callable[..., object], tuple[Any, ...], int | None]
-_UPDATE, _MARGINALIZE = gtsam.ISAM2.update, gtsam.ISAM2.marginalizeLeaves
-# Number of steps between copies of the graph: at least the first, and one for so many poses of the
-# second, so that copying costs an update the same at any size.
-_N_REPLAYED = 16
-_POSES_PER_STEP = 32
-_MIN_EIGENVALUE = 1e-10
-_MAX_ROUNDING = 1e-6
+# Poses that leave at once when the window is made smaller: the cost grows with the cube.
+_MAX_LEAVING = 32
+_FAILURES = RuntimeError, IndexError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class NewPose:
+    """A pose to be put into the window, with the measurements that passed the gate.
+
+    `support` constrains a pose that its measurements do not: the origin, or the last velocity.
+    """
+
+    frame_id: FrameId
+    stamp_ns: int
+    T_world_start: gtsam.Pose3
+    measurements: Sequence[Measurement] = ()
+    prior: Prior | None = None
+    support: Edge | PosePrior | None = None
+    rejected: tuple[Rejected, ...] = ()
+    n_gated: int = 0
+    misfit: float = math.nan
+
+    @property
+    def is_measured(self) -> bool:
+        """Tell whether a measurement constrains the pose, or it is the origin."""
+        return bool(self.measurements) or self.prior is not None or self.support is ORIGIN
+
+
+@dataclass(slots=True, kw_only=True)
+class WindowPose:
+    """A pose of the window, its measurements with their factors, and its estimate as it came in.
+
+    Edges stay in the list when their references leave.
+    """
+
+    key: int
+    stamp_ns: int
+    edges: list[tuple[Edge, gtsam.NoiseModelFactor]] = field(default_factory=list)
+    priors: list[tuple[Prior, gtsam.NoiseModelFactor]] = field(default_factory=list)
+    is_kept: bool = False
+    causal: Estimate | None = None
 
 
 class PoseGraph:
-    """Poses by integer keys, smoothed incrementally; old ones can be marginalized.
+    """Poses and their measurements in iSAM2; those neither recent nor kept are marginalized.
 
-    Parameters
-    ----------
-    is_whole : bool
-        Nothing will be marginalized, and the graph may grow large.
-    is_hardened : bool
-        Slower, but works with sigmas many orders of magnitude apart.
+    If GTSAM fails in a change, everything is as before, and a `SmoothingError` says why.
     """
 
-    def __init__(self, *, is_whole: bool = False, is_hardened: bool = False) -> None:
+    def __init__(self, config: WindowConfig) -> None:
+        self.poses: dict[FrameId, WindowPose] = {}
+        """By the caller's names, oldest first."""
+        self._config, self._factors = config, Factors(config)
+        self._finished: list[Estimate] = []
+        self._n_keys = 0
+        self._begin()
+
+    def reconfigure(self, config: WindowConfig) -> None:
+        """Set another size, and another kernel for later measurements."""
+        self._config, self._factors = config, Factors(config)
+        if not self.poses:
+            self._begin()
+
+    def _begin(self) -> None:
+        self.poses.clear()
+        self._is_whole, self._is_hardened = self._config.size is None, False
+        self._isam = gtsam.ISAM2(self._parameters())
+
+    def _parameters(self) -> gtsam.ISAM2Params:
         parameters = gtsam.ISAM2Params()
-        self._is_whole, self.is_hardened = is_whole, is_hardened
         # QR takes three times as long. Cholesky calls the system indeterminate once the drift's
         # variance is 4096^2 times that of an edge.
-        parameters.setFactorization("QR" if is_hardened else "CHOLESKY")
-        if is_whole:
+        parameters.setFactorization("QR" if self._is_hardened else "CHOLESKY")
+        if self._is_whole:
             # GTSAM's defaults, which trade accuracy for time: the batch optimization at the end
             # makes up for it.
             parameters.setRelinearizeThreshold(0.1)
@@ -66,244 +136,335 @@ class PoseGraph:
             # Propagate every change to the oldest pose: by default small ones are ignored, which
             # loses what smoothing gains with edges accurate to a tenth of a millimetre.
             parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
-        self._isam = gtsam.ISAM2(parameters)
-        self._n_poses = 0
-        self._saved: gtsam.ISAM2 | None = None
-        self._done: list[_Step] = []
-        self._is_guarded = False
+        return parameters
 
-    def hardened(self) -> PoseGraph:
-        """Return a graph of the same factors that takes worse conditioned ones too."""
-        return self._remade(self.values(), is_hardened=True)
+    def _make(self, factors: gtsam.NonlinearFactorGraph, points: gtsam.Values) -> None:
+        """Make the graph anew of these factors, linearized at these poses."""
+        isam = gtsam.ISAM2(self._parameters())
+        isam.update(factors, points)
+        self._isam = isam
 
-    def moved(self, values: gtsam.Values) -> PoseGraph:
-        """Return a graph of the same factors, linearized at other values."""
-        return self._remade(values, is_hardened=self.is_hardened)
+    # Who is there
 
-    def _remade(self, values: gtsam.Values, *, is_hardened: bool) -> PoseGraph:
-        graph = PoseGraph(is_whole=self._is_whole, is_hardened=is_hardened)
-        with graph.restored_on_error():
-            graph.update(self.factors(), values)
-        return graph
-
-    @contextmanager
-    def restored_on_error(self) -> Iterator[None]:
-        """Restore the graph if an update inside the context fails or is interrupted.
-
-        The time of a copy grows with the graph, so there is none before each update: the steps
-        since the last copy are replayed.
-
-        Raises
-        ------
-        SmoothingError
-            In place of GTSAM's exceptions.
-        """
-        n_replayed = max(_N_REPLAYED, self._n_poses // _POSES_PER_STEP)
-        if self._saved is None or len(self._done) >= n_replayed:
-            self._saved, self._done = gtsam.ISAM2(self._isam), []
-        before = self._saved, len(self._done), self._n_poses
-        self._is_guarded = True
+    def find(self, frame_id: FrameId) -> WindowPose | None:
+        """Return a pose, or None if it is not in the window; a `ValueError` if it cannot be."""
         try:
-            yield
-        except BaseException as error:
-            self._restore(*before)
-            if isinstance(error, RuntimeError | IndexError):
-                raise SmoothingError(f"GTSAM: {first_line(error)}") from error
-            raise
-        finally:
-            self._is_guarded = False
+            return self.poses.get(frame_id)
+        except TypeError:
+            raise ValueError(f"a frame_id must be hashable, got {frame_id!r}") from None
 
-    def _restore(self, saved: gtsam.ISAM2, n_done: int, n_poses: int) -> None:
-        del self._done[n_done:]
-        isam = gtsam.ISAM2(saved)
-        for function, arguments, key in self._done:
-            function(isam, *arguments)
-            if key is not None:
-                isam.calculateEstimatePose3(key)
-        self._isam, self._n_poses = isam, n_poses
+    def require(self, frame_id: FrameId) -> WindowPose:
+        """Return a pose of the window; a `ValueError` if it is not there."""
+        pose = self.find(frame_id)
+        if pose is None:
+            raise ValueError(absence(frame_id))
+        return pose
 
-    def _note(self, step: _Step) -> None:
-        """Record a step for replay; outside of `restored_on_error` nothing is restored."""
-        if self._is_guarded:
-            self._done.append(step)
-        else:
-            self._saved = None
+    def current_edges(self, pose: WindowPose) -> Iterator[tuple[Edge, gtsam.NoiseModelFactor]]:
+        """Yield the edges of a pose whose references are still in the window."""
+        for edge, factor in pose.edges:
+            reference = self.poses.get(edge.reference_id)
+            # Another pose may have the name of one that left, but not its key.
+            if reference is not None and reference.key in factor.keys():  # noqa: SIM118
+                yield edge, factor
 
-    def update(
-        self,
-        factors: gtsam.NonlinearFactorGraph,
-        values: gtsam.Values,
-        *,
-        alive: Collection[int] = (),
-        leaving: Sequence[int] = (),
-    ) -> None:
-        """Add factors and poses; make leaving poses ready to be marginalized.
+    def _leaving(self) -> list[FrameId]:
+        """Return the frames to marginalize with the next pose: neither recent nor kept."""
+        if self._config.size is None:
+            return []
+        old = islice(self.poses.items(), max(len(self.poses) + 1 - self._config.size, 0))
+        return [frame_id for frame_id, pose in old if not pose.is_kept][:_MAX_LEAVING]
 
-        Parameters
-        ----------
-        factors : gtsam.NonlinearFactorGraph
-        values : gtsam.Values
-            Start values of new poses, which the factors tie.
-        alive : collection of int
-            All keys in the graph; needed if some are leaving.
-        leaving : sequence of int
-            Keys to eliminate first, each in a group of its own, so that they become leaves of
-            the Bayes tree: only these can be marginalized.
-        """
-        constraints = self._constraints(factors, alive, leaving) if leaving else ()
-        self._isam.update(factors, values, *constraints)
-        self._n_poses += values.size()
-        # Asking a whole graph for estimates propagates small changes.
-        key = next(iter(factors.keyVector()), None) if self._is_whole else None
-        self._note((_UPDATE, (factors, values, *constraints), key))
+    # What goes in
 
-    def _constraints(
-        self, factors: gtsam.NonlinearFactorGraph, alive: Collection[int], leaving: Sequence[int]
-    ) -> tuple[Any, ...]:
-        """Return the arguments that make leaving poses leaves of the Bayes tree."""
-        n_leaving = len(leaving)
-        groups = dict.fromkeys(alive, n_leaving)
-        # The poses that the factors constrain come last: their covariances are cheap then, and
-        # the next pose usually has edges to the same ones.
-        groups |= dict.fromkeys(factors.keyVector(), n_leaving + 1)
-        groups |= {key: group for group, key in enumerate(leaving)}
-        constrained, reeliminate = gtsam.KeyGroupMap(), gtsam.KeyList()
-        for key, group in groups.items():
-            constrained.insert2(key, group)
-        for key in alive:
-            reeliminate.push_back(key)
-        return [], constrained, None, reeliminate, False
+    def insert(self, new: NewPose) -> tuple[FloatArray, FloatArray]:
+        """Add a pose, let old ones leave; return T_world_frame (4, 4) and its covariance (6, 6)."""
+        return self._attempt(lambda: self._insert(new))
 
-    def iterate(
-        self,
-        before: Mapping[int, gtsam.Pose3],
-        starts: Mapping[int, gtsam.Pose3],
-        *,
-        alive: Collection[int] = (),
-        leaving: Sequence[int] = (),
-    ) -> bool:
-        """Repeat the last update until poses converge, if it moved them far.
-
-        One step of Gauss-Newton is exact only for motions by a fraction of a radian; closing a
-        loop takes a few. A whole graph is left to the batch optimization at its end.
-
-        Parameters
-        ----------
-        before : mapping of int to gtsam.Pose3
-            Poses before the update, of the keys concerned.
-        starts : mapping of int to gtsam.Pose3
-            Start values of new poses.
-        alive, leaving
-            As for the update.
-
-        Returns
-        -------
-        bool
-            Whether the poses may have moved far.
-        """
-        if self._is_whole:
-            return True
-        poses = {**before, **starts}
-        if _converged(poses, self.poses3(poses), _FAR):
-            return False
-        self._settle(poses, alive, leaving)
-        return True
-
-    def _settle(self, keys: Iterable[int], alive: Collection[int], leaving: Sequence[int]) -> None:
-        """Repeat the last update until poses converge."""
-        after = self.poses3(keys)
-        for _ in range(_MAX_STEPS):
-            nothing, before = (gtsam.NonlinearFactorGraph(), gtsam.Values()), after
-            self.update(*nothing, alive=alive, leaving=leaving)
-            after = self.poses3(keys)
-            if _converged(before, after, _STILL):
-                break
-
-    def marginalize(self, keys: Sequence[int]) -> None:
-        """Marginalize poses that the last update made leaves."""
+    def _insert(self, new: NewPose) -> tuple[FloatArray, FloatArray]:
+        if self._is_whole and self._config.size is not None:  # from now on poses leave
+            self._is_whole = False
+            self._make(self._isam.getFactorsUnsafe(), self._isam.getLinearizationPoint())
+        pose, factors = self._with_factors(new)
+        values = gtsam.Values()
+        values.insert(pose.key, new.T_world_start)
+        leaving = self._leaving()
+        keys = [self.poses[frame_id].key for frame_id in leaving]
+        self._update(factors, values, keys)
+        T_world_frame, covariance = self._pose(pose.key), self._covariance(pose.key)
+        _check(T_world_frame)
+        finished = [self._estimate(frame_id) for frame_id in leaving]
         for key in keys:
             leaf = gtsam.KeyList()
             leaf.push_back(key)
             self._isam.marginalizeLeaves(leaf)
-            self._n_poses -= 1
-            self._note((_MARGINALIZE, (leaf,), None))
+        for frame_id in leaving:
+            del self.poses[frame_id]
+        self._finished += finished
+        self._n_keys += 1
+        self.poses[new.frame_id] = pose
+        return T_world_frame, covariance
 
-    def pose3(self, key: int) -> gtsam.Pose3:
-        """Return T_world_frame as GTSAM holds it."""
-        return self._isam.calculateEstimatePose3(key)
+    def _with_factors(self, new: NewPose) -> tuple[WindowPose, gtsam.NonlinearFactorGraph]:
+        key, graph = self._n_keys, gtsam.NonlinearFactorGraph()
+        pose = WindowPose(key=key, stamp_ns=new.stamp_ns)
+        for measurement in new.measurements:
+            reference_key = self.poses[measurement.edge.reference_id].key
+            factor = self._factors.between(reference_key, key, measurement)
+            pose.edges.append((measurement.edge, factor))
+            graph.add(factor)
+        if new.prior is not None:
+            factor = self._factors.prior(key, new.prior)
+            pose.priors.append((new.prior, factor))
+            graph.add(factor)
+        if isinstance(new.support, Edge):
+            reference_key = self.poses[new.support.reference_id].key
+            graph.add(self._factors.between(reference_key, key, Measurement.of(new.support)))
+        elif new.support is not None:
+            graph.add(self._factors.prior(key, new.support))
+        return pose, graph
 
-    def poses3(self, keys: Iterable[int]) -> dict[int, gtsam.Pose3]:
-        """Return T_world_frame of each."""
-        return {key: self.pose3(key) for key in keys}
+    def add_edge(self, frame_id: FrameId, edge: Edge) -> Estimate:
+        """Add an edge between two poses of the window; return the new estimate of the frame."""
+        pose, reference = self.poses[frame_id], self.poses[edge.reference_id]
+        factor = self._factors.between(reference.key, pose.key, Measurement.of(edge))
+        estimate = self._attempt(lambda: self._add_factor(frame_id, factor))
+        pose.edges.append((edge, factor))
+        return estimate
 
-    def pose(self, key: int) -> FloatArray:
-        """Return T_world_frame, shape (4, 4)."""
-        return np.asarray(self.pose3(key).matrix())
+    def add_prior(self, frame_id: FrameId, prior: Prior) -> Estimate:
+        """Add a prior to a pose of the window; return its new estimate."""
+        pose = self.poses[frame_id]
+        factor = self._factors.prior(pose.key, prior)
+        estimate = self._attempt(lambda: self._add_factor(frame_id, factor))
+        pose.priors.append((prior, factor))
+        return estimate
 
-    def covariance(self, key: int) -> FloatArray:
-        """Return the marginal covariance of a pose, shape (6, 6), symmetric positive definite."""
+    def _add_factor(self, frame_id: FrameId, factor: gtsam.NoiseModelFactor) -> Estimate:
+        factors = gtsam.NonlinearFactorGraph()
+        factors.add(factor)
+        self._update(factors, gtsam.Values())
+        return self._estimate(frame_id)
+
+    def _update(
+        self,
+        factors: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        leaving: Sequence[int] = (),
+    ) -> None:
+        """Add factors and poses; repeat until no pose is far from where it was linearized.
+
+        One step of Gauss-Newton is exact only for motions by a fraction of a radian; closing a
+        loop takes a few. A whole graph is left to the batch optimization at its end.
+        """
+        constraints = self._constraints(factors.keyVector(), leaving)
+        self._isam.update(factors, values, *constraints)
+        if self._is_whole:
+            return
+        n_steps = 0
+        while n_steps < _MAX_STEPS and not np.abs(self._isam.getDelta().vector()).max() < _FAR:
+            self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), *constraints)
+            n_steps += 1
+        if n_steps > 0:
+            _check(gtsam.utilities.extractPose3(self._isam.calculateEstimate()))
+
+    def _constraints(self, last: Sequence[int], leaving: Sequence[int]) -> tuple[Any, ...]:
+        """Return the arguments of an update that make leaving poses leaves of the Bayes tree.
+
+        Only these can be marginalized; each is in a group of its own, which is eliminated first.
+        """
+        if not leaving:
+            return ()
+        n_leaving = len(leaving)
+        groups = dict.fromkeys((pose.key for pose in self.poses.values()), n_leaving)
+        # The poses that the factors constrain come last: their covariances are cheap then, and
+        # the next pose usually has edges to the same ones.
+        groups |= dict.fromkeys(last, n_leaving + 1)
+        groups |= {key: group for group, key in enumerate(leaving)}
+        constrained, reeliminate = gtsam.KeyGroupMap(), gtsam.KeyList()
+        for key, group in groups.items():
+            constrained.insert2(key, group)
+            reeliminate.push_back(key)
+        return [], constrained, None, reeliminate, False
+
+    # When GTSAM fails
+
+    def _attempt(self, act: Callable[[], _Result]) -> _Result:
+        """Return what `act` answers; if GTSAM fails, once more with the graph solved by QR."""
+        while True:
+            was_hardened, saved = self._is_hardened, self._snapshot()
+            try:
+                return act()
+            except BaseException as error:
+                self._restore(*saved)
+                if not isinstance(error, _FAILURES):
+                    raise
+                message = first_line(error)
+                if was_hardened:
+                    raise SmoothingError(f"GTSAM: {message}") from error
+                _LOGGER.info("GTSAM: %s; from here on the graph is solved by QR", message)
+
+    def _snapshot(self) -> tuple[int, tuple[gtsam.NonlinearFactorGraph, gtsam.Values] | None]:
+        """Return the number of factors, and copies of them and of what they are linearized at.
+
+        A whole graph only grows, and is not copied for each pose: what is left of one that failed
+        tells what was before.
+        """
+        factors = self._isam.getFactorsUnsafe()
+        if self._is_whole:
+            return factors.size(), None
+        points = gtsam.Values(self._isam.getLinearizationPoint())
+        return factors.size(), (gtsam.NonlinearFactorGraph(factors), points)
+
+    def _restore(
+        self, n_factors: int, saved: tuple[gtsam.NonlinearFactorGraph, gtsam.Values] | None
+    ) -> None:
+        """Make the graph anew as it was: linearized at the same poses, it has the same optimum."""
+        if saved is None:
+            factors = gtsam.NonlinearFactorGraph(self._isam.getFactorsUnsafe())
+            points = gtsam.Values(self._isam.getLinearizationPoint())
+            factors.resize(n_factors)
+            if points.exists(self._n_keys):
+                points.erase(self._n_keys)
+            saved = factors, points
+        self._is_hardened = True
+        with suppress(*_FAILURES):  # then the next change fails, and the window begins anew
+            self._make(*saved)
+
+    # What comes out
+
+    def pose3(self, frame_id: FrameId) -> gtsam.Pose3:
+        """Return T_world_frame of a pose of the window as GTSAM holds it."""
+        return self._isam.calculateEstimatePose3(self.poses[frame_id].key)
+
+    def pose(self, frame_id: FrameId) -> FloatArray:
+        """Return T_world_frame, shape (4, 4), of a pose of the window."""
+        return self._pose(self.poses[frame_id].key)
+
+    def _pose(self, key: int) -> FloatArray:
+        return np.asarray(self._isam.calculateEstimatePose3(key).matrix())
+
+    def _covariance(self, key: int) -> FloatArray:
         return definite(self._isam.marginalCovariance(key))
 
-    def joint_covariance(self, first: int, second: int) -> FloatArray:
-        """Return the joint covariance of two poses, shape (12, 12), in the order asked for."""
-        return np.asarray(self._isam.jointMarginalCovariance([first, second]).fullMatrix())
+    def estimate(self, frame_id: FrameId) -> Estimate:
+        """Return the estimate of a pose; the causal one if GTSAM has none any more."""
+        try:
+            return self._attempt(lambda: self._estimate(frame_id))
+        except SmoothingError as error:
+            pose = self.poses[frame_id]
+            place = f"{frame_id!r} at {pose.stamp_ns} ns"
+            _LOGGER.warning("%s: %s; its causal pose is returned", place, first_line(error))
+            if pose.causal is None:
+                raise
+            return replace(pose.causal, rejected=())
 
-    def positions(self) -> FloatArray:
-        """Return the positions of all poses in the world, shape (n, 3), metres."""
-        return np.asarray(gtsam.utilities.extractPose3(self.values())[:, 9:])
+    def _estimate(self, frame_id: FrameId) -> Estimate:
+        pose = self.poses[frame_id]
+        T_world_frame = self._pose(pose.key)
+        _check(T_world_frame)
+        return Estimate(
+            stamp_ns=pose.stamp_ns,
+            T_world_frame=T_world_frame,
+            covariance=self._covariance(pose.key),
+            status=Status.OK if pose.causal is None else pose.causal.status,
+            frame_id=frame_id,
+        )
 
-    def factors(self) -> gtsam.NonlinearFactorGraph:
-        """Return all factors, marginals among them."""
-        return self._isam.getFactorsUnsafe()
+    def relative_covariance(self, reference_id: FrameId, frame_id: FrameId) -> FloatArray:
+        """Return the covariance (6, 6) of T_reference_frame; zero of a pose to itself."""
+        if reference_id == frame_id:
+            return np.zeros((6, 6))
+        T = se3.invert(self.pose(reference_id)) @ self.pose(frame_id)
+        # T exp(d) = (T_r exp(d_r))^-1 T_f exp(d_f)  =>  d = d_f - Ad(T^-1) d_r
+        J = np.hstack([-se3.adjoint(se3.invert(T)), np.eye(6)])
+        keys = [self.poses[reference_id].key, self.poses[frame_id].key]
 
-    def values(self) -> gtsam.Values:
-        """Return all poses."""
-        return self._isam.calculateEstimate()
+        def read() -> FloatArray:
+            return definite(J @ self._isam.jointMarginalCovariance(keys).fullMatrix() @ J.T)
+
+        try:
+            return self._attempt(read)
+        except SmoothingError:
+            # Their correlation is lost in rounding: without it the covariance is no smaller.
+            independent = np.zeros((12, 12))
+            independent[:6, :6] = self.estimate(reference_id).covariance
+            independent[6:, 6:] = self.estimate(frame_id).covariance
+            return definite(J @ independent @ J.T)
+
+    def measurements(self) -> list[GraphEdge]:
+        """Return the measurements between poses of the window, with their residuals."""
+        values, found = self._isam.calculateEstimate(), []
+        for frame_id, pose in self.poses.items():
+            for edge, factor in self.current_edges(pose):
+                measured = edge.reference_id, edge.T_reference_frame, edge.covariance
+                found.append(_graph_edge(frame_id, *measured, factor, values))
+            for prior, factor in pose.priors:
+                if isinstance(prior, PosePrior):
+                    T = prior.T_world_frame
+                else:
+                    T = se3.make_transform(self._pose(pose.key)[:3, :3], prior.position_world)
+                found.append(_graph_edge(frame_id, None, T, prior.covariance, factor, values))
+        return found
+
+    def keep_causal(self, estimate: Estimate) -> None:
+        """Keep the causal estimate of a pose; it is final if the pose is not in the graph."""
+        pose = self.poses.get(estimate.frame_id)
+        if pose is None:
+            self._finished.append(estimate)
+        else:
+            pose.causal = estimate
+
+    def pop_finished(self) -> list[Estimate]:
+        """Return the smoothed estimates of the poses that left since the last call."""
+        finished, self._finished = self._finished, []
+        return finished
+
+    def finish(self) -> BatchResult | None:
+        """Optimize a whole graph in a batch, then begin anew."""
+        result = None
+        if self._is_whole and self.poses:
+            factors = self._isam.getFactorsUnsafe()
+            try:
+                optimized, result = optimize_batch(factors, self._isam.calculateEstimate())
+                self._make(factors, optimized)
+            except RuntimeError as error:
+                _LOGGER.warning(
+                    "no batch optimization, the poses are those of iSAM2: %s", first_line(error)
+                )
+        self.begin_anew()
+        return result
+
+    def begin_anew(self) -> None:
+        """Let all poses leave, and begin with an empty graph."""
+        self._finished += [self.estimate(frame_id) for frame_id in self.poses]
+        self._begin()
 
 
-def _converged(
-    before: Mapping[int, gtsam.Pose3], after: Mapping[int, gtsam.Pose3], limit: float
-) -> bool:
-    """Tell whether each element of the twists between poses before and after is below a limit."""
-    # If no element of the transforms differs by more than 0.4 of the limit, no twist exceeds it:
-    # an angle is at most 3 / sqrt(2), a distance sqrt(3) times the largest difference.
-    if all(before[key].equals(after[key], 0.4 * limit) for key in before):
-        return True
-    moves = [before[key].localCoordinates(after[key]).tolist() for key in before]
-    return bool(max(max(map(abs, move)) for move in moves) < limit)
+def absence(frame_id: FrameId) -> str:
+    """Return the message for a frame that is not in the window."""
+    return f"{frame_id!r} is not in the window: it has left, or never was"
 
 
-def first_line(error: BaseException) -> str:
-    """Return the first line of an error message, or the name of its type."""
-    return (str(error).strip() or type(error).__name__).splitlines()[0]
+def _check(poses: FloatArray) -> None:
+    if fault := place_fault(poses):
+        raise RuntimeError(fault)
 
 
-def definite(covariance: FloatArray) -> FloatArray:
-    """Return the covariance, symmetric positive definite in spite of rounding.
-
-    With sigmas many orders of magnitude apart, rounding may leave the smallest eigenvalue of the
-    correlations at or below zero.
-    """
-    symmetric = _symmetric(covariance)
-    return symmetric if is_definite(symmetric) else _repaired(symmetric)
-
-
-def _symmetric(covariance: FloatArray) -> FloatArray:
-    symmetric = 0.5 * (covariance + covariance.T)
-    if not math.isfinite(np.add.reduce(symmetric, axis=None)):
-        raise SmoothingError("GTSAM: a covariance is not finite")
-    return np.asarray(symmetric)
-
-
-def _repaired(symmetric: FloatArray) -> FloatArray:
-    """Clip the eigenvalues of the correlations that rounding made too small."""
-    variances = np.diag(symmetric)
-    if variances.min() <= 0.0:
-        raise SmoothingError("GTSAM: a variance is not positive")
-    scale = np.outer(np.sqrt(variances), np.sqrt(variances))
-    eigenvalues, vectors = np.linalg.eigh(symmetric / scale)
-    if eigenvalues[0] < -_MAX_ROUNDING:
-        raise SmoothingError("GTSAM: a covariance is not positive definite")
-    clipped = np.maximum(eigenvalues, _MIN_EIGENVALUE)
-    repaired = (vectors * clipped) @ vectors.T * scale
-    return np.asarray(0.5 * (repaired + repaired.T))
+def _graph_edge(
+    frame_id: FrameId,
+    reference_id: FrameId,
+    T_reference_frame: FloatArray,
+    covariance: FloatArray,
+    factor: gtsam.NoiseModelFactor,
+    values: gtsam.Values,
+) -> GraphEdge:
+    residual, weight = residual_of(factor, values)
+    return GraphEdge(
+        reference_id=reference_id,
+        frame_id=frame_id,
+        T_reference_frame=T_reference_frame,
+        covariance=covariance,
+        residual=residual,
+        weight=weight,
+    )

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import logging
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
 
+import gtsam
 import numpy as np
 
 from gvo.backend.batch import BatchResult
-from gvo.backend.factors import ORIGIN, find_faults, prior_fault
-from gvo.backend.gating import Admission, WindowCounter, WindowCounts, disagreement
+from gvo.backend.factors import ORIGIN, Measurement, find_faults, prior_fault
+from gvo.backend.gating import Prediction, disagreement, gate_edges
 from gvo.backend.keyframe_policy import choose_released, is_needed, proximity
 from gvo.backend.motion_model import ConstantVelocity, StatusClock
-from gvo.backend.window_graph import NewPose, WindowGraph, absence
+from gvo.backend.pose_graph import NewPose, PoseGraph, absence
 from gvo.config import WindowConfig
 from gvo.errors import SmoothingError, write_faults
 from gvo.geometry import se3
@@ -37,6 +39,42 @@ from gvo.types import (
 Keeping = Literal["manual", "distance"]
 
 _LOGGER = logging.getLogger(__name__)
+
+# Of a first pose of which only the position is known: radians, and metres beside its prior.
+_UNKNOWN_COVARIANCE = np.diag(np.repeat([1.0, 1e4], 3) ** 2)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WindowCounts:
+    """Counts of what a window accepted and refused so far.
+
+    Parameters
+    ----------
+    n_poses, n_edges, n_priors : int
+        Accepted.
+    n_rejected : int
+        Refused edges and priors, the gated ones among them.
+    n_gated : int
+        Edges refused because others contradict them.
+    n_coasting : int
+        Poses without a usable edge, which continue the last velocity.
+    n_restored : int
+        Updates in which GTSAM failed; the window was restored.
+    n_rebuilt : int
+        Times that GTSAM failed with a pose alone; all poses left, and the window began anew.
+    first_rejected : str
+        The first refusal; empty before it.
+    """
+
+    n_poses: int = 0
+    n_edges: int = 0
+    n_priors: int = 0
+    n_rejected: int = 0
+    n_gated: int = 0
+    n_coasting: int = 0
+    n_restored: int = 0
+    n_rebuilt: int = 0
+    first_rejected: str = ""
 
 
 class SlidingWindow:
@@ -89,12 +127,12 @@ class SlidingWindow:
             _check_config(config)
         self._config = config or WindowConfig()
         self._keeps_by_distance = keyframes == "distance"
-        self._graph = WindowGraph(self._config)
+        self._graph = PoseGraph(self._config)
         self._poses = self._graph.poses
-        self._counter = WindowCounter()
+        self._counted: Counter[str] = Counter()
+        self._first_rejected = ""
         self._clock = StatusClock(self._config.lost_after_s)
         self._motion = ConstantVelocity(self._config)
-        self._admission = Admission(self._graph, self._motion)
         self._batch_result: BatchResult | None = None
         self.variance_factor = 1.0
         self.misfit = math.nan
@@ -119,12 +157,12 @@ class SlidingWindow:
     @property
     def newest(self) -> FrameId:
         """The newest frame of the window; None while it is empty."""
-        return self._poses.newest
+        return next(reversed(self._poses), None)
 
     @property
     def counts(self) -> WindowCounts:
         """What was accepted and refused so far."""
-        return self._counter.counts
+        return WindowCounts(**self._counted, first_rejected=self._first_rejected)
 
     @property
     def batch_result(self) -> BatchResult | None:
@@ -193,21 +231,21 @@ class SlidingWindow:
         """
         edges = _as_edges(frame_id, edges)
         self._check_new(frame_id, stamp_ns, edges, prior)
-        pose = self._admission.admit(frame_id, int(stamp_ns), edges, prior, gate=self._config.gate)
-        pose, T_world_frame, covariance = self._insert(pose)
-        found = self._clock.next(pose.stamp_ns, is_measured=pose.is_measured)
+        new = self._gated(frame_id, int(stamp_ns), edges, prior)
+        new, T_world_frame, covariance = self._insert(new)
+        found = self._clock.next(new.stamp_ns, is_measured=new.is_measured)
         estimate = Estimate(
             frame_id=frame_id,
-            stamp_ns=pose.stamp_ns,
+            stamp_ns=new.stamp_ns,
             T_world_frame=T_world_frame,
             covariance=covariance,
-            status=status if status and pose.is_measured else found,
-            rejected=pose.rejected,
+            status=status if status and new.is_measured else found,
+            rejected=new.rejected,
         )
         self._graph.keep_causal(estimate)
-        self._counter.add_pose(pose)
-        self.misfit = pose.misfit
-        self._update_motion(pose, estimate)
+        self._count(new)
+        self.misfit = new.misfit
+        self._update_motion(new, estimate)
         if self._keeps_by_distance and frame_id in self:
             self._keep_by_distance(frame_id)
         return self._scaled(estimate)
@@ -226,16 +264,17 @@ class SlidingWindow:
         Estimate or Rejected
             The new estimate of the frame; falsy if the edge was refused.
         """
-        self._poses.find(frame_id)
+        pose = self._graph.find(frame_id)
         _as_edges(frame_id, [edge])
-        fault = self._poses.edge_fault(frame_id, edge) or find_faults([edge])[0]
+        fault = "" if pose else absence(frame_id)
+        fault = self._absence(frame_id, edge) or fault or find_faults([edge])[0]
         gated = "" if fault else self._gate_loop(frame_id, edge)
         if fault or gated:
             return self._reject(frame_id, fault or gated, edge=edge, is_gated=bool(gated))
         answer = self._try(lambda: self._graph.add_edge(frame_id, edge), frame_id, edge=edge)
         if isinstance(answer, Rejected):
             return answer
-        self._counter.add(n_edges=1)
+        self._counted["n_edges"] += 1
         return self._scaled(answer)
 
     def add_prior(self, frame_id: FrameId, prior: Prior) -> Estimate | Rejected:
@@ -252,31 +291,31 @@ class SlidingWindow:
             The new estimate of the frame; falsy if the prior was refused.
         """
         _check_prior(frame_id, prior)
-        is_there = self._poses.find(frame_id) is not None
+        is_there = self._graph.find(frame_id) is not None
         fault = prior_fault(prior) if is_there else absence(frame_id)
         if fault:
             return self._reject(frame_id, fault)
         answer = self._try(lambda: self._graph.add_prior(frame_id, prior), frame_id)
         if isinstance(answer, Rejected):
             return answer
-        self._counter.add(n_priors=1)
+        self._counted["n_priors"] += 1
         return self._scaled(answer)
 
     def keep(self, frame_id: FrameId) -> None:
         """Keep a pose in the window until it is released."""
-        self._poses.require(frame_id).is_kept = True
+        self._graph.require(frame_id).is_kept = True
 
     def release(self, frame_id: FrameId) -> None:
         """Let a kept pose leave with the next update, unless it is recent."""
-        self._poses.require(frame_id).is_kept = False
+        self._graph.require(frame_id).is_kept = False
 
     def kept(self) -> list[FrameId]:
         """Return the kept frames, oldest first."""
-        return self._poses.kept
+        return [frame_id for frame_id, pose in self._poses.items() if pose.is_kept]
 
     def pose(self, frame_id: FrameId) -> FloatArray:
         """Return T_world_frame, shape (4, 4), of a pose of the window."""
-        self._poses.require(frame_id)
+        self._graph.require(frame_id)
         return self._graph.pose(frame_id)
 
     def poses(self) -> dict[FrameId, FloatArray]:
@@ -288,15 +327,15 @@ class SlidingWindow:
         pose = self._poses.get(frame_id)
         if pose is None:
             return ()
-        return tuple(accepted.edge for accepted in self._poses.current_edges(pose))
+        return tuple(edge for edge, _ in self._graph.current_edges(pose))
 
     def stamp_ns(self, frame_id: FrameId) -> int:
         """Return the stamp of a pose of the window, nanoseconds."""
-        return self._poses.require(frame_id).stamp_ns
+        return self._graph.require(frame_id).stamp_ns
 
     def estimate(self, frame_id: FrameId) -> Estimate:
         """Return the current estimate of a pose of the window."""
-        self._poses.require(frame_id)
+        self._graph.require(frame_id)
         return self._scaled(self._graph.estimate(frame_id))
 
     def covariance(self, frame_id: FrameId) -> FloatArray:
@@ -368,7 +407,7 @@ class SlidingWindow:
     def _check_new(
         self, frame_id: FrameId, stamp_ns: int, edges: Sequence[Edge], prior: Prior | None
     ) -> None:
-        is_known = self._poses.find(frame_id) is not None
+        is_known = self._graph.find(frame_id) is not None
         if frame_id is None or is_known:
             raise ValueError(
                 f"{frame_id!r} is in the window already"
@@ -404,46 +443,152 @@ class SlidingWindow:
         self, frame_id: FrameId, reason: str, *, edge: Edge | None = None, is_gated: bool = False
     ) -> Rejected:
         pose = self._poses.get(frame_id)
-        rejected = Rejected(
-            frame_id=frame_id,
-            stamp_ns=None if pose is None else pose.stamp_ns,
-            reason=reason,
-            reference_id=None if edge is None else edge.reference_id,
-        )
-        self._counter.add_rejected(rejected, is_gated=is_gated)
+        rejected = _refusal(frame_id, None if pose is None else pose.stamp_ns, edge, reason)
+        self._counted["n_gated"] += int(is_gated)
+        self._count_rejected([rejected])
         return rejected
+
+    def _count(self, new: NewPose) -> None:
+        self._counted["n_poses"] += 1
+        self._counted["n_edges"] += len(new.measurements)
+        self._counted["n_priors"] += int(new.prior is not None)
+        self._counted["n_coasting"] += int(not new.is_measured)
+        self._counted["n_gated"] += new.n_gated
+        self._count_rejected(new.rejected)
+
+    def _count_rejected(self, rejected: Sequence[Rejected]) -> None:
+        self._counted["n_rejected"] += len(rejected)
+        if rejected and not self._first_rejected:
+            self._first_rejected = str(rejected[0])
+
+    # What passes the gate
+
+    def _gated(
+        self, frame_id: FrameId, stamp_ns: int, edges: Sequence[Edge], prior: Prior | None
+    ) -> NewPose:
+        """Return a pose with its valid measurements that pass the gate."""
+        refused: list[tuple[Edge | None, str]] = []
+        if prior is not None and (fault := prior_fault(prior)):
+            refused, prior = [(None, fault)], None
+        predictions = []
+        for edge, fault in zip(edges, find_faults(edges), strict=True):
+            if fault := self._absence(frame_id, edge) or fault:
+                refused.append((edge, fault))
+            else:
+                predictions.append(self._predict(edge))
+        if not predictions:
+            return self._unmeasured(frame_id, stamp_ns, prior, refused)
+        gated = gate_edges(
+            predictions,
+            relative_covariance=self._graph.relative_covariance,
+            motion=lambda: self._coast(stamp_ns),
+            gate=self._config.gate,
+        )
+        refused += gated.refused
+        return NewPose(
+            frame_id=frame_id,
+            stamp_ns=stamp_ns,
+            T_world_start=gated.T_world_start,
+            measurements=gated.accepted,
+            prior=prior,
+            rejected=tuple(_refusal(frame_id, stamp_ns, *each) for each in refused),
+            n_gated=len(gated.refused),
+            misfit=gated.misfit,
+        )
+
+    def _absence(self, frame_id: FrameId, edge: Edge) -> str:
+        """Say why the reference of an edge cannot be one; empty if it can."""
+        if edge.reference_id == frame_id:
+            return "an edge of a pose to itself"
+        return "" if edge.reference_id in self._poses else absence(edge.reference_id)
+
+    def _predict(self, edge: Edge) -> Prediction:
+        measurement = Measurement.of(edge)
+        T_world_reference = self._graph.pose3(edge.reference_id)
+        return Prediction(measurement, T_world_reference.compose(measurement.T_reference_frame))
+
+    def _coast(self, stamp_ns: int) -> Prediction | None:
+        """Return the edge that the last velocity predicts; None if the last pose has left."""
+        last = self._motion.last
+        if last is None or last.frame_id not in self._poses:
+            return None
+        T_last_frame, covariance = self._motion.predict_step(stamp_ns)
+        return self._predict(
+            Edge(
+                reference_id=last.frame_id,
+                T_reference_frame=T_last_frame,
+                covariance=covariance,
+                kernel="none",
+            )
+        )
+
+    def _unmeasured(
+        self,
+        frame_id: FrameId,
+        stamp_ns: int,
+        prior: Prior | None,
+        refused: Sequence[tuple[Edge | None, str]],
+    ) -> NewPose:
+        """Return a pose without edges; it continues the last velocity if nothing else is known."""
+        support: Edge | PosePrior | None = None
+        if isinstance(prior, PosePrior):
+            T_world_start = gtsam.Pose3(prior.T_world_frame)
+        elif (coasted := self._coast(stamp_ns)) is not None:
+            support, T_world_start = coasted.edge, coasted.T_world_frame
+        else:
+            support = self._support(stamp_ns, prior)
+            T_world_start = gtsam.Pose3(support.T_world_frame)
+        return NewPose(
+            frame_id=frame_id,
+            stamp_ns=stamp_ns,
+            T_world_start=T_world_start,
+            prior=prior,
+            support=support,
+            rejected=tuple(_refusal(frame_id, stamp_ns, *each) for each in refused),
+        )
+
+    def _support(self, stamp_ns: int, prior: PositionPrior | None) -> PosePrior:
+        """Return where a pose begins that no pose of the window leads to."""
+        if (prediction := self._motion.predict_pose(stamp_ns)) is not None:
+            return PosePrior(T_world_frame=prediction[0], covariance=prediction[1])
+        if prior is None:
+            return ORIGIN
+        T_world_start = se3.make_transform(np.eye(3), prior.position_world)
+        return PosePrior(T_world_frame=T_world_start, covariance=_UNKNOWN_COVARIANCE)
 
     # What goes into the graph
 
-    def _insert(self, pose: NewPose) -> tuple[NewPose, FloatArray, FloatArray]:
-        """Put a pose into the graph; if GTSAM fails, retry with ever less.
+    def _insert(self, new: NewPose) -> tuple[NewPose, FloatArray, FloatArray]:
+        """Put a pose into the graph, without measurements where GTSAM fails.
 
         Returns
         -------
-        pose : NewPose
+        new : NewPose
             As it went in.
         T_world_frame : ndarray of float64, shape (4, 4)
         covariance : ndarray of float64, shape (6, 6)
         """
-        for simplify in (None, self._refuse_all, self._rebuild_for):
+        for is_alone in (False, True):
+            new = self._refuse_all(new) if is_alone else new
             try:
-                pose = pose if simplify is None else simplify(pose)
-                return pose, *self._graph.insert(pose)
+                return new, *self._graph.insert(new)
             except SmoothingError as error:
-                self._counter.add(n_restored=1)
-                place = f"{pose.frame_id!r} at {pose.stamp_ns} ns"
-                _LOGGER.warning("%s: %s; the window is restored", place, error)
-        # Not even alone: it is returned as predicted, and never in the window.
-        prediction = self._motion.predict_pose(pose.stamp_ns)
-        return pose, *(prediction or (ORIGIN.T_world_frame, ORIGIN.covariance))
+                self._note_failure(f"{new.frame_id!r} at {new.stamp_ns} ns", error)
+        # Not even alone: it is handed over as predicted, and the next pose begins a window.
+        self._graph.begin_anew()
+        self._counted["n_rebuilt"] += 1
+        start = self._support(new.stamp_ns, None)
+        return new, start.T_world_frame, start.covariance
 
-    def _refuse_all(self, pose: NewPose) -> NewPose:
-        return self._admission.refuse_all(pose, "GTSAM gave up on the update")
-
-    def _rebuild_for(self, pose: NewPose) -> NewPose:
-        self._graph.rebuild()
-        self._counter.add(n_rebuilt=1)
-        return pose
+    def _refuse_all(self, new: NewPose) -> NewPose:
+        """Return the pose without measurements."""
+        refused: list[Edge | None] = [measurement.edge for measurement in new.measurements]
+        refused += [] if new.prior is None else [None]
+        reason = "GTSAM gave up on the update"
+        alone = self._unmeasured(
+            new.frame_id, new.stamp_ns, None, [(edge, reason) for edge in refused]
+        )
+        return replace(alone, rejected=new.rejected + alone.rejected, n_gated=new.n_gated)
 
     def _try(
         self, extend: Callable[[], Estimate], frame_id: FrameId, *, edge: Edge | None = None
@@ -452,17 +597,20 @@ class SlidingWindow:
         try:
             return extend()
         except SmoothingError as error:
-            self._counter.add(n_restored=1)
-            _LOGGER.warning("%r: %s; the window is restored", frame_id, error)
+            self._note_failure(repr(frame_id), error)
             return self._reject(frame_id, f"GTSAM gave up on the update: {error}", edge=edge)
 
-    def _update_motion(self, pose: NewPose, estimate: Estimate) -> None:
+    def _note_failure(self, place: str, error: SmoothingError) -> None:
+        self._counted["n_restored"] += 1
+        _LOGGER.warning("%s: %s; the window is restored", place, error)
+
+    def _update_motion(self, new: NewPose, estimate: Estimate) -> None:
         """Update the velocity if edges, and not a prior alone, say how the camera moved."""
         measured_id = self._motion.measured_id
-        is_known = bool(pose.measurements) and measured_id in self._poses
+        is_known = bool(new.measurements) and measured_id in self._poses
         self._motion.append(
             estimate,
-            is_measured=pose.is_measured,
+            is_measured=new.is_measured,
             T_world_measured=self._graph.pose(measured_id) if is_known else None,
         )
 
@@ -493,3 +641,9 @@ def _check_config(config: WindowConfig) -> None:
 def _check_prior(frame_id: FrameId, prior: Prior) -> None:
     if not isinstance(prior, PosePrior | PositionPrior):
         raise ValueError(f"the prior of {frame_id!r} must be a PosePrior or a PositionPrior")
+
+
+def _refusal(frame_id: FrameId, stamp_ns: int | None, edge: Edge | None, reason: str) -> Rejected:
+    """Return the refusal of an edge of a pose, or of its prior."""
+    reference_id = None if edge is None else edge.reference_id
+    return Rejected(frame_id=frame_id, stamp_ns=stamp_ns, reason=reason, reference_id=reference_id)

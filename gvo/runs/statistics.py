@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gvo.backend.batch import BatchResult
-from gvo.backend.gating import WindowCounts
+from gvo.backend.window import WindowCounts
 from gvo.frontend.calibration import RigOffsets
 from gvo.types import FaultyFrame, FrameResult, Progress, SegmentJoin, Status
 

@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import integrate, stats
 
-from gvo.backend.factors import Factors, Measurement
+from gvo.backend.factors import Factors, Measurement, residual_of
 from gvo.config import Kernel, WindowConfig
+from gvo.geometry import se3
 from gvo.types import Edge, FloatArray, PosePrior, PositionPrior
 from tests.backend.walks import edge, seeds, shifted
 
@@ -82,69 +83,48 @@ def test_the_constants_lose_as_little_of_good_data(kernel: Kernel) -> None:
     assert efficiency == pytest.approx(0.9984, abs=2e-4)
 
 
+# Residuals, as a window lists them.
+
+
+def poses_at(*poses: FloatArray) -> gtsam.Values:
+    values = gtsam.Values()
+    for key, T in enumerate(poses):
+        values.insert(key, gtsam.Pose3(T))
+    return values
+
+
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_a_residual_names_the_weight_of_its_kernel(kernel: Kernel) -> None:
-    far = replace(edge("a", shifted(6.0), 1.0), kernel=kernel)
-    found = Factors(WindowConfig()).residual_of_edge(far, "b", np.eye(4), np.eye(4))
-    np.testing.assert_allclose(found.residual, [0, 0, 0, -6, 0, 0], atol=1e-12)
+    far = replace(edge(0, shifted(6.0), 1.0), kernel=kernel)
+    factor = Factors(WindowConfig()).between(0, 1, Measurement.of(far))
+    residual, found = residual_of(factor, poses_at(np.eye(4), np.eye(4)))
+    np.testing.assert_allclose(residual, [0, 0, 0, -6, 0, 0], atol=1e-12)
     expected = 1.0 if kernel == "none" else float(weight(kernel, np.array(6.0), CONSTANTS[kernel]))
-    assert found.weight == pytest.approx(expected)
-    assert found.chi2 == pytest.approx(36.0)
-
-
-def test_a_position_weighs_along_the_axes_of_the_world() -> None:
-    prior = PositionPrior(position_world=np.zeros(3), covariance=np.diag([1.0, 4.0, 9.0]))
-    T = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.3, 0.4, 0.5), np.array([1.0, 2.0, 3.0]))
-    values = gtsam.Values()
-    values.insert(7, T)
-    factors = Factors(WindowConfig())
-    assert factors.prior(7, prior).error(values) == pytest.approx(1.5)
-    found = factors.residual_of_prior(prior, "a", T.matrix())
-    np.testing.assert_allclose(found.residual, [1.0, 1.0, 1.0])
+    assert found == pytest.approx(expected)
 
 
 @given(seed=seeds)
-def test_residuals_are_those_of_gtsam_in_the_axes_of_the_frame(seed: int) -> None:
+def test_residuals_are_twists_from_what_was_measured_in_sigmas(seed: int) -> None:
     rng = np.random.default_rng(seed)
     first, second, measured = (
-        gtsam.Pose3.Expmap(np.r_[rng.normal(size=3), 5.0 * rng.normal(size=3)]) for _ in range(3)
+        se3.exp(np.r_[rng.normal(size=3), 5.0 * rng.normal(size=3)]) for _ in range(3)
     )
-    covariance = np.diag(rng.uniform(0.1, 2.0, 6) ** 2)
-    sigmas = np.sqrt(np.diag(covariance))
-    edge = Edge(reference_id="a", T_reference_frame=measured.matrix(), covariance=covariance)
-    factors = Factors(WindowConfig(kernel="none"))
-    found = factors.residual_of_edge(edge, "b", first.matrix(), second.matrix())
-    expected = gtsam.Pose3.Logmap(first.compose(measured).inverse().compose(second))
-    np.testing.assert_allclose(found.residual, expected / sigmas, atol=1e-7)
-    assert (found.reference_id, found.frame_id, found.weight) == ("a", "b", 1.0)
-    assert found.T_reference_frame is edge.T_reference_frame
-
-    prior = PosePrior(T_world_frame=measured.matrix(), covariance=covariance)
-    found = factors.residual_of_prior(prior, "b", second.matrix())
-    expected = gtsam.Pose3.Logmap(measured.inverse().compose(second))
-    np.testing.assert_allclose(found.residual, expected / sigmas, atol=1e-7)
-    assert (found.reference_id, found.frame_id) == (None, "b")
-    made = factors.prior(3, prior)
-    values = gtsam.Values()
-    values.insert(3, second)
-    whitened = found.residual @ found.residual
-    assert made.error(values) == pytest.approx(0.5 * whitened, rel=1e-6)
-
+    root = rng.normal(size=(6, 6)) * rng.uniform(0.1, 2.0, 6)
+    covariance = root @ root.T + 1e-3 * np.eye(6)
+    # Which whitens is the upper root of the information.
+    R, R_place = (np.linalg.cholesky(np.linalg.inv(C)).T for C in (covariance, covariance[:3, :3]))
+    factors, values = Factors(WindowConfig(kernel="none")), poses_at(first, second)
+    one = Edge(reference_id=0, T_reference_frame=measured, covariance=covariance)
+    there = PosePrior(T_world_frame=measured, covariance=covariance, kernel="huber")
     place = PositionPrior(position_world=rng.normal(size=3), covariance=covariance[:3, :3])
-    at = factors.residual_of_prior(place, "b", second.matrix())
-    np.testing.assert_allclose(
-        at.residual, (second.translation() - place.position_world) / sigmas[:3], atol=1e-9
-    )
-    np.testing.assert_allclose(at.T_reference_frame[:3, :3], second.rotation().matrix())
-    np.testing.assert_array_equal(at.T_reference_frame[:3, 3], place.position_world)
-
-
-def test_a_residual_is_whitened_by_the_upper_root_of_the_information() -> None:
-    factor = np.random.default_rng(2).normal(size=(3, 3))
-    covariance = factor @ factor.T
-    place = PositionPrior(position_world=np.zeros(3), covariance=covariance)
-    T = np.eye(4)
-    T[:3, 3] = [0.3, -0.2, 0.5]
-    found = Factors(WindowConfig()).residual_of_prior(place, "a", T)
-    R = np.linalg.cholesky(np.linalg.inv(covariance)).T
-    np.testing.assert_allclose(found.residual, R @ T[:3, 3], rtol=1e-9)
+    for factor, expected in (
+        (
+            factors.between(0, 1, Measurement.of(one)),
+            R @ se3.log(np.linalg.inv(first @ measured) @ second),
+        ),
+        (factors.prior(1, there), R @ se3.log(np.linalg.inv(measured) @ second)),
+        # Of a position along the axes of the world.
+        (factors.prior(1, place), R_place @ (second[:3, 3] - place.position_world)),
+    ):
+        found, _ = residual_of(factor, values)
+        np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)

@@ -695,6 +695,18 @@ def test_keyframes_may_come_and_go_for_hundreds_of_poses(seed: int) -> None:
     assert np.abs(windowed - batched).max() < 0.7 * drift
 
 
+def test_factors_that_left_make_room_for_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    slots, original = list[int](), gtsam.ISAM2.update
+
+    def update(isam: Any, *arguments: Any) -> Any:
+        slots.append(isam.getFactorsUnsafe().size())
+        return original(isam, *arguments)
+
+    monkeypatch.setattr(gtsam.ISAM2, "update", update)
+    walk(WindowConfig(size=3), 60)
+    assert max(slots[10:]) == max(slots[-10:]) < 12
+
+
 # A loop that turns what it closes: one linearization is not enough.
 
 
@@ -748,7 +760,7 @@ def test_a_pose_that_closes_a_large_turn_settles_with_others(turn_rad: float, si
     assert answer.rejected == ()
     everything = [*edges, *((N, each) for each in arriving)]
     optimum, _ = optimum_of(before | {N: power(N)}, everything)
-    np.testing.assert_allclose(answer.T_world_frame, optimum.atPose3(N).matrix(), atol=2e-4)
+    np.testing.assert_allclose(answer.T_world_frame, optimum.atPose3(N).matrix(), atol=1e-3)
     for frame, T in enumerate(window.poses().values()):
         np.testing.assert_allclose(T, optimum.atPose3(frame).matrix(), atol=1e-3)
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gvo.backend.pose_graph import PoseGraph
 from gvo.backend.window import SlidingWindow
 from gvo.config import WindowConfig
 from gvo.geometry import se3
@@ -41,7 +40,7 @@ from tests.backend.twins import (
     twin_without_edges,
     with_entry,
 )
-from tests.backend.walks import STEP, STEP_NS, edge, power, shifted, walk
+from tests.backend.walks import STEP, STEP_NS, edge, shifted, walk
 
 
 def assert_names(
@@ -363,21 +362,6 @@ def test_what_goes_in_is_counted_once_and_what_is_refused_by_its_kind() -> None:
     assert [each.reference_id for each in estimate.rejected] == ["nobody"]
     window.add_pose(7, 7 * STEP_NS, [])
     assert window.counts.n_coasting == 1
-
-
-def test_the_gate_of_a_late_edge_asks_for_one_joint_covariance(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    window, asked = walk(WindowConfig(), 5), list[tuple[int, ...]]()
-    joint = PoseGraph.joint_covariance
-
-    def count(graph: PoseGraph, *keys: int) -> FloatArray:
-        asked.append(keys)
-        return joint(graph, *keys)
-
-    monkeypatch.setattr(PoseGraph, "joint_covariance", count)
-    assert window.add_edge(4, edge(1, power(3)))
-    assert len(asked) == 1
 
 
 def test_the_gate_of_a_late_edge_is_in_sigmas_of_what_it_and_the_window_know() -> None:

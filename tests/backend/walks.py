@@ -52,7 +52,7 @@ def walk(
 
 @contextmanager
 def failing(
-    name: str, calls: Container[int] | None = None, error: type[Exception] = RuntimeError
+    name: str, calls: Container[int] | None = None, error: type[BaseException] = RuntimeError
 ) -> Iterator[list[int]]:
     """Make a method of ISAM2 fail at these calls, or always; give the numbers of all calls."""
     original = getattr(gtsam.ISAM2, name)

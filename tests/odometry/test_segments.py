@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gvo.backend.window_graph import NewPose, WindowGraph
+from gvo.backend.pose_graph import NewPose, PoseGraph
 from gvo.config import Config
 from gvo.errors import SmoothingError
 from gvo.geometry import se3
@@ -203,14 +203,14 @@ def test_a_join_is_no_step_and_each_step_is_of_one_state_of_the_window() -> None
 
 def test_after_a_frame_without_a_window_the_step_is_raw(monkeypatch: pytest.MonkeyPatch) -> None:
     places = walk(n_dark=0, n_after=0, away=np.eye(4))
-    insert = WindowGraph.insert
+    insert = PoseGraph.insert
 
-    def fail_once(graph: WindowGraph, pose: NewPose) -> tuple[FloatArray, FloatArray]:
+    def fail_once(graph: PoseGraph, pose: NewPose) -> tuple[FloatArray, FloatArray]:
         if pose.stamp_ns == places[5].stamp_ns:
             raise SmoothingError("no")
         return insert(graph, pose)
 
-    monkeypatch.setattr(WindowGraph, "insert", fail_once)
+    monkeypatch.setattr(PoseGraph, "insert", fail_once)
     results = run(Beacon(), places)
     before, after = results[5].raw.T_world_frame, results[6].raw.T_world_frame
     step = results[6].T_previous_frame
