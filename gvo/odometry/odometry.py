@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -46,6 +46,26 @@ from gvo.types import (
 # Whatever the front-end returns.
 _Observations: TypeAlias = Any
 _Offer: TypeAlias = tuple[LinkKind, Edge]
+
+
+class _Links(NamedTuple):
+    """How a frame was measured from others: its edges, by kind, in the order they are offered.
+
+    Parameters
+    ----------
+    scores : dict of int to float
+        Of the keyframes, see `Keyframes.scores`.
+    offered : list of (kind, Edge)
+    found : tuple of Loop, or None
+        See `Map.search`.
+    is_joining : bool
+        The last edge joins another part.
+    """
+
+    scores: dict[int, float]
+    offered: list[_Offer]
+    found: tuple[Loop, ...] | None = None
+    is_joining: bool = False
 
 
 # Of the misclosures that a variance factor is averaged over: errors that last do not show at once.
@@ -185,37 +205,18 @@ class Odometry:
         with watch.stage("extract"):
             self._take_over_configuration()
             observations = self._frontend.extract(frame)
-        offsets = self._frontend.rig_offsets
         with watch.stage("register"):
-            step = self._chain.advance(
-                observations,
-                variance_factor=1.0 if offsets is None else offsets.chain_factor.value,
-                seeks_places=self._map.seeks_places,
-            )
-            self._note_break(step)
+            step = self._step(observations)
         with watch.stage("links"):
-            self._map.follow(step)
-            scores, offered = self._link(observations, step)
-            offered += self._align_depths(observations, offered)
-        with watch.stage("loops"):
-            links = [edge for kind, edge in offered if kind == "keyframe"]
-            is_needed = self._is_keyframe_needed(scores)
-            found = self._map.search(observations, step, links, is_keyframe=is_needed)
-            joining = self._map.joining(found)
+            links = self._link(observations, step)
         with watch.stage("window"):
-            offered += [] if joining is None else [("keyframe", joining)]
-            causal = self._add_to_window(step, offered, is_resumed=joining is not None)
-            if offsets is not None:
-                offsets.window_factor.note(self._window.misfit)
-            T_previous_frame = self._last_step(step.estimate, causal)
-            self._select_keyframes(observations, step, scores, causal)
-            self._keep_anchor()
+            causal, T_previous_frame = self._smooth(step, links)
+            self._select_keyframes(observations, step, links.scores, causal)
         with watch.stage("loops"):
-            self._map.variance_factor = self._trust.variance_factor
-            joins, loops = self._map.add(observations, causal, found, self._chain.anchor)
+            joins, loops = self._map.add(observations, causal, links.found, self._chain.anchor)
         self._keep_frame(frame)
         poses = causal, T_previous_frame
-        return self._result(observations, step, offered, *poses, joins, loops, watch.stage_ms)
+        return self._result(observations, step, links.offered, *poses, joins, loops, watch.stage_ms)
 
     def finish(self) -> tuple[Estimate, ...]:
         """Return the smoothed poses of the frames still in the window."""
@@ -326,28 +327,48 @@ class Odometry:
             if stamp_ns in self._window:
                 self._window.release(stamp_ns)
 
-    def _link(
-        self, observations: _Observations, step: RawStep
-    ) -> tuple[dict[int, float], list[_Offer]]:
-        """Return the keyframes' scores, and edges to the predecessor and to keyframes."""
+    def _step(self, observations: _Observations) -> RawStep:
+        """Register a frame against the one before, in the raw chain."""
+        offsets = self._frontend.rig_offsets
+        step = self._chain.advance(
+            observations,
+            variance_factor=1.0 if offsets is None else offsets.chain_factor.value,
+            seeks_places=self._map.seeks_places,
+        )
+        self._note_break(step)
+        return step
+
+    def _link(self, observations: _Observations, step: RawStep) -> _Links:
+        """Measure a frame from its predecessor, from keyframes, and after a gap from places."""
+        self._map.follow(step)
         # A coasted step is no measurement: the window predicts by itself.
-        offered: list[_Offer] = []
-        if step.registration is not None:
-            offered.append(("step", step.edge))
+        offered: list[_Offer] = [] if step.registration is None else [("step", step.edge)]
         if step.reference_ns not in self._window:  # which would refuse the edges
-            return {}, offered
+            return _Links(scores={}, offered=offered)
         T_frame_keyframes = self._predict_keyframes(step)
         scores = self._keyframes.scores(T_frame_keyframes)
+        links = self._link_keyframes(observations, step, scores, T_frame_keyframes)
+        offered += [("keyframe", edge) for edge in links]
+        offered += [("depth", edge) for edge in self._align_depths(observations, links)]
+        is_needed = self._is_keyframe_needed(scores)
+        found = self._map.search(observations, step, links, is_keyframe=is_needed)
+        joining = self._map.joining(found)
+        offered += [] if joining is None else [("keyframe", joining)]
+        return _Links(scores=scores, offered=offered, found=found, is_joining=joining is not None)
+
+    def _link_keyframes(
+        self,
+        observations: _Observations,
+        step: RawStep,
+        scores: dict[int, float],
+        T_frame_keyframes: dict[int, FloatArray],
+    ) -> list[Edge]:
         self._keyframes.note_seen(scores, step.n_steps)
         measure = partial(self._register_keyframe, observations, step)
-        config = self._config.window
         in_view = {ns: T for ns, T in T_frame_keyframes.items() if scores[ns] >= MIN_OVERLAP}
         n_unasked = self._keyframes.n_unasked(in_view, step.n_steps)
-        links = link_keyframes(
-            measure, scores, T_frame_keyframes, step, config, n_unasked=n_unasked
-        )
-        offered += [("keyframe", edge) for edge in links]
-        return scores, offered
+        config = self._config.window
+        return link_keyframes(measure, scores, T_frame_keyframes, step, config, n_unasked=n_unasked)
 
     def _predict_keyframes(self, step: RawStep) -> dict[int, FloatArray]:
         """Return T_frame_keyframe by stamp, of joined segments, as predicted by the step."""
@@ -397,13 +418,13 @@ class Odometry:
         scaled = replace(link, covariance=factor.value * link.covariance)
         factor.note(factor.value * misclosure(scaled, start, step.estimate))
 
-    def _align_depths(self, observations: _Observations, offered: list[_Offer]) -> list[_Offer]:
+    def _align_depths(self, observations: _Observations, links: list[Edge]) -> list[Edge]:
         """Return what depth alone measured beside links, where colour contradicts it."""
-        links = [edge for kind, edge in offered if kind == "keyframe"]
         if not links or not self._trust.is_due():
             return []
-        edges = (self._align_depth(observations, link) for link in links)
-        return [("depth", edge) for edge in edges if edge is not None]
+        edges = [self._align_depth(observations, link) for link in links]
+        self._map.variance_factor = self._trust.variance_factor
+        return [edge for edge in edges if edge is not None]
 
     def _align_depth(self, observations: _Observations, link: Edge) -> Edge | None:
         """Measure a link again by depth alone; None where that is not believed."""
@@ -418,11 +439,15 @@ class Odometry:
         T = depth.T_reference_current
         return Edge(reference_id=link.reference_id, T_reference_frame=T, covariance=covariance)
 
-    def _add_to_window(self, step: RawStep, offered: list[_Offer], *, is_resumed: bool) -> Estimate:
-        stamp_ns = step.estimate.stamp_ns
-        edges = [edge for _, edge in offered]
-        status = Status.RESUMED if is_resumed else None
-        return self._window.add_pose(stamp_ns, stamp_ns, edges, status=status)
+    def _smooth(self, step: RawStep, links: _Links) -> tuple[Estimate, FloatArray | None]:
+        """Add a frame to the window; return its causal pose, and that in the frame before."""
+        stamp_ns, offsets = step.estimate.stamp_ns, self._frontend.rig_offsets
+        edges = [edge for _, edge in links.offered]
+        status = Status.RESUMED if links.is_joining else None
+        causal = self._window.add_pose(stamp_ns, stamp_ns, edges, status=status)
+        if offsets is not None:
+            offsets.window_factor.note(self._window.misfit)
+        return causal, self._last_step(step.estimate, causal)
 
     def _last_step(self, raw: Estimate, causal: Estimate) -> FloatArray | None:
         """Return T_previous_frame, of one state of the window; by the raw chain without one."""
@@ -439,13 +464,13 @@ class Odometry:
     ) -> None:
         """Keep and release keyframes; none while the pose is only a guess."""
         is_tied = causal.status in (Status.OK, Status.RESUMED)
-        if not is_tied or causal.frame_id not in self._window:
-            return
-        if self._is_keyframe_needed(scores):
-            self._keyframes.add(observations, n_steps=step.n_steps)
-            self._starts[causal.stamp_ns] = step.estimate
-            self._window.keep(causal.stamp_ns)
-        self._release_keyframes(scores, step.n_steps)
+        if is_tied and causal.frame_id in self._window:
+            if self._is_keyframe_needed(scores):
+                self._keyframes.add(observations, n_steps=step.n_steps)
+                self._starts[causal.stamp_ns] = step.estimate
+                self._window.keep(causal.stamp_ns)
+            self._release_keyframes(scores, step.n_steps)
+        self._keep_anchor()
 
     def _is_keyframe_needed(self, scores: dict[int, float]) -> bool:
         config = self._config.window
