@@ -27,10 +27,10 @@ from gvo.backend.factors import (
     ORIGIN,
     Factors,
     Measurement,
+    check_places,
     definite,
     find_faults,
     first_line,
-    place_fault,
     prior_fault,
 )
 from gvo.config import WindowConfig
@@ -51,8 +51,6 @@ INLIER_CHI2 = 16.812
 _SHARPENING = 1.4
 _MAX_SHARPENINGS = 200
 _STEPS_EACH = 2
-# Steps of a small graph, whose start is good.
-_N_LOCAL_STEPS = 5
 # Below this share of the largest pivot one is rounding.
 _LEAST_PIVOT = 1e-15
 # Covariances between two reports of progress.
@@ -260,114 +258,6 @@ class WholeGraph:
         return poses
 
 
-class LocalPose(NamedTuple):
-    """A pose in the origin of a small graph, its covariance, and that with the last pose."""
-
-    T_origin_frame: FloatArray
-    covariance: FloatArray
-    with_last: FloatArray
-
-
-class LocalGraph:
-    """A few poses around one of them, which is the origin.
-
-    Parameters
-    ----------
-    origin : hashable
-        The name of that pose.
-    factors : Factors
-        With the kernel of the edges.
-    """
-
-    def __init__(self, origin: FrameId, factors: Factors) -> None:
-        self._origin, self._make = origin, factors
-        self._graph = gtsam.NonlinearFactorGraph()
-        # Along the first edges: T_origin_frame and its covariance.
-        self._poses = {origin: (np.eye(4), np.zeros((6, 6)))}
-        self._references: dict[FrameId, FrameId] = {}
-        self._keys: dict[FrameId, int] = {}
-
-    def __contains__(self, frame_id: object) -> bool:
-        """Tell whether a pose is there."""
-        return frame_id in self._poses
-
-    def add(self, frame_id: FrameId, edge: Edge) -> None:
-        """Add an edge; one of its poses is there already."""
-        reference_id, T = edge.reference_id, edge.T_reference_frame
-        if frame_id not in self._poses and reference_id in self._poses:
-            T_reference, covariance = self._poses[reference_id]
-            moved = se3.compose_covariance(covariance, T, edge.covariance)
-            self._poses[frame_id] = T_reference @ T, moved
-            self._references[frame_id] = reference_id
-        elif reference_id not in self._poses:
-            T_frame, covariance = self._poses[frame_id]
-            Ad, T = se3.adjoint(T), se3.invert(T)
-            moved = se3.compose_covariance(covariance, T, Ad @ edge.covariance @ Ad.T)
-            self._poses[reference_id] = T_frame @ T, moved
-            self._references[reference_id] = frame_id
-        if reference_id == self._origin:
-            prior = PosePrior(
-                T_world_frame=edge.T_reference_frame,
-                covariance=edge.covariance,
-                kernel=edge.kernel or self._make.default,
-            )
-            self._graph.add(self._make.prior(self._key(frame_id), prior))
-        else:
-            keys = self._key(reference_id), self._key(frame_id)
-            self._graph.add(self._make.between(*keys, Measurement.of(edge)))
-
-    def _key(self, frame_id: FrameId) -> int:
-        return self._keys.setdefault(frame_id, len(self._keys))
-
-    def solve(self, last: FrameId = None) -> dict[FrameId, LocalPose]:
-        """Return the poses, by name.
-
-        Parameters
-        ----------
-        last : hashable, optional
-            The pose with which the covariances of the others are wanted.
-        """
-        found = self._along_first_edges(last)
-        if self._graph.size() == len(found):  # a tree
-            return found
-        values = gtsam.Values()
-        for frame_id, key in self._keys.items():
-            values.insert(key, gtsam.Pose3(found[frame_id].T_origin_frame))
-        last_key = self._keys.get(last)
-        try:
-            for values, *_ in descend(self._graph, values, n_steps=_N_LOCAL_STEPS):  # noqa: B007, B020
-                pass
-            marginals = gtsam.Marginals(self._graph, values)
-            poses = as_transforms(values)
-            return {
-                frame_id: LocalPose(
-                    poses[key],
-                    definite(marginals.marginalCovariance(key)),
-                    found[frame_id].with_last
-                    if last_key in (None, key)
-                    else marginals.jointMarginalCovariance([key, last_key]).at(key, last_key),
-                )
-                for frame_id, key in self._keys.items()
-            }
-        except RuntimeError:
-            return found
-
-    def _along_first_edges(self, last: FrameId) -> dict[FrameId, LocalPose]:
-        """Return the poses as the first edge of each tells."""
-        before, before_last = last, set[FrameId]()
-        while before in self._references:
-            before_last.add(before)
-            before = self._references[before]
-        T_origin_last, none = self._poses.get(last, self._poses[self._origin])[0], np.zeros((6, 6))
-        found = {}
-        for frame_id in self._keys:
-            T, covariance = self._poses[frame_id]
-            Ad = se3.adjoint(se3.invert(T_origin_last) @ T)
-            with_last = covariance @ Ad.T if frame_id in before_last else none
-            found[frame_id] = LocalPose(T, covariance, with_last)
-        return found
-
-
 class BatchOptimizer:
     """Optimizes a graph by Levenberg-Marquardt, a step at a time.
 
@@ -477,8 +367,8 @@ class BatchOptimizer:
         self.start = min(self.starts, key=self.starts.__getitem__)
         self.values, self.error = starts[self.start], self.starts[self.start]
 
-    def run(self, *, only_refuse: bool = False) -> None:
-        """Optimize until the error converges, or until it is known which edges are refused.
+    def run(self) -> None:
+        """Optimize until the error converges.
 
         Raises
         ------
@@ -488,12 +378,10 @@ class BatchOptimizer:
         try:
             if self._is_graduated and self._doubted:
                 self._graduate()
-            if not only_refuse:
-                self.is_converged = self._descend(_MAX_ITERATIONS)
+            self.is_converged = self._descend(_MAX_ITERATIONS)
+            check_places(self.poses()[:, :3, 3])
         except RuntimeError as error:
             raise SmoothingError(f"GTSAM: {first_line(error)}") from error
-        if fault := place_fault(self.poses()[:, :3, 3]):
-            raise SmoothingError(f"GTSAM: {fault}")
 
     def _descend(self, n_steps: int) -> bool:
         """Descend at most so many steps; tell whether the error has converged."""

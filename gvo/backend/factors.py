@@ -115,11 +115,11 @@ def find_faults(edges: Sequence[Edge]) -> list[str]:
     ]
 
 
-def place_fault(poses: FloatArray) -> str:
-    """Say why optimized poses or positions are invalid; empty if they are valid."""
+def check_places(poses: FloatArray) -> None:
+    """Raise a `RuntimeError`, as GTSAM does, if optimized poses or positions diverged."""
     largest = float(np.abs(poses).max())
-    is_far = not largest <= 2.0 * _MAX_COORDINATE_M  # NaN too
-    return f"a pose diverged to {largest:.3g} m" if is_far else ""
+    if not largest <= 2.0 * _MAX_COORDINATE_M:  # NaN too
+        raise RuntimeError(f"a pose diverged to {largest:.3g} m")
 
 
 def prior_fault(prior: Prior) -> str:

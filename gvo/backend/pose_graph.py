@@ -24,9 +24,9 @@ from gvo.backend.factors import (
     ORIGIN,
     Factors,
     Measurement,
+    check_places,
     definite,
     first_line,
-    place_fault,
     residual_of,
 )
 from gvo.config import WindowConfig
@@ -88,8 +88,7 @@ class WindowPose:
 
     key: int
     stamp_ns: int
-    edges: list[tuple[Edge, gtsam.NoiseModelFactor]] = field(default_factory=list)
-    priors: list[tuple[Prior, gtsam.NoiseModelFactor]] = field(default_factory=list)
+    measured: list[tuple[Edge | Prior, gtsam.NoiseModelFactor]] = field(default_factory=list)
     is_kept: bool = False
     causal: Estimate | None = None
 
@@ -160,13 +159,17 @@ class PoseGraph:
             raise ValueError(absence(frame_id))
         return pose
 
-    def current_edges(self, pose: WindowPose) -> Iterator[tuple[Edge, gtsam.NoiseModelFactor]]:
-        """Yield the edges of a pose whose references are still in the window."""
-        for edge, factor in pose.edges:
-            reference = self.poses.get(edge.reference_id)
-            # Another pose may have the name of one that left, but not its key.
-            if reference is not None and reference.key in factor.keys():  # noqa: SIM118
-                yield edge, factor
+    def measurements_of(
+        self, frame_id: FrameId
+    ) -> Iterator[tuple[Edge | Prior, gtsam.NoiseModelFactor]]:
+        """Yield the priors of a pose, and its edges whose references are still in the window."""
+        for measured, factor in self.poses[frame_id].measured:
+            if isinstance(measured, Edge):
+                reference = self.poses.get(measured.reference_id)
+                # Another pose may have the name of one that left, but not its key.
+                if reference is None or reference.key not in factor.keys():  # noqa: SIM118
+                    continue
+            yield measured, factor
 
     def _leaving(self) -> list[FrameId]:
         """Return the frames to marginalize with the next pose: neither recent nor kept."""
@@ -192,8 +195,8 @@ class PoseGraph:
         keys = [self.poses[frame_id].key for frame_id in leaving]
         self._update(factors, values, keys)
         T_world_frame, covariance = self._pose(pose.key), self._covariance(pose.key)
-        _check(T_world_frame)
-        finished = [self._estimate(frame_id) for frame_id in leaving]
+        check_places(T_world_frame)
+        finished = list(map(self._estimate, leaving))
         for key in keys:
             leaf = gtsam.KeyList()
             leaf.push_back(key)
@@ -206,44 +209,36 @@ class PoseGraph:
         return T_world_frame, covariance
 
     def _with_factors(self, new: NewPose) -> tuple[WindowPose, gtsam.NonlinearFactorGraph]:
-        key, graph = self._n_keys, gtsam.NonlinearFactorGraph()
-        pose = WindowPose(key=key, stamp_ns=new.stamp_ns)
-        for measurement in new.measurements:
-            reference_key = self.poses[measurement.edge.reference_id].key
-            factor = self._factors.between(reference_key, key, measurement)
-            pose.edges.append((measurement.edge, factor))
-            graph.add(factor)
+        pose, graph = WindowPose(key=self._n_keys, stamp_ns=new.stamp_ns), _graph_of()
+        for each in new.measurements:
+            pose.measured.append((each.edge, self._between(pose.key, each)))
         if new.prior is not None:
-            factor = self._factors.prior(key, new.prior)
-            pose.priors.append((new.prior, factor))
+            pose.measured.append((new.prior, self._factor(pose.key, new.prior)))
+        for _, factor in pose.measured:
             graph.add(factor)
-        if isinstance(new.support, Edge):
-            reference_key = self.poses[new.support.reference_id].key
-            graph.add(self._factors.between(reference_key, key, Measurement.of(new.support)))
-        elif new.support is not None:
-            graph.add(self._factors.prior(key, new.support))
+        if new.support is not None:
+            graph.add(self._factor(pose.key, new.support))
         return pose, graph
 
-    def add_edge(self, frame_id: FrameId, edge: Edge) -> Estimate:
-        """Add an edge between two poses of the window; return the new estimate of the frame."""
-        pose, reference = self.poses[frame_id], self.poses[edge.reference_id]
-        factor = self._factors.between(reference.key, pose.key, Measurement.of(edge))
-        estimate = self._attempt(lambda: self._add_factor(frame_id, factor))
-        pose.edges.append((edge, factor))
-        return estimate
+    def _factor(self, key: int, measured: Edge | Prior) -> gtsam.NoiseModelFactor:
+        if isinstance(measured, Edge):
+            return self._between(key, Measurement.of(measured))
+        return self._factors.prior(key, measured)
 
-    def add_prior(self, frame_id: FrameId, prior: Prior) -> Estimate:
-        """Add a prior to a pose of the window; return its new estimate."""
+    def _between(self, key: int, measurement: Measurement) -> gtsam.NoiseModelFactor:
+        reference_key = self.poses[measurement.edge.reference_id].key
+        return self._factors.between(reference_key, key, measurement)
+
+    def extend(self, frame_id: FrameId, measured: Edge | Prior) -> Estimate:
+        """Add an edge to, or a prior of, a pose of the window; return its new estimate."""
         pose = self.poses[frame_id]
-        factor = self._factors.prior(pose.key, prior)
+        factor = self._factor(pose.key, measured)
         estimate = self._attempt(lambda: self._add_factor(frame_id, factor))
-        pose.priors.append((prior, factor))
+        pose.measured.append((measured, factor))
         return estimate
 
     def _add_factor(self, frame_id: FrameId, factor: gtsam.NoiseModelFactor) -> Estimate:
-        factors = gtsam.NonlinearFactorGraph()
-        factors.add(factor)
-        self._update(factors, gtsam.Values())
+        self._update(_graph_of(factor), gtsam.Values())
         return self._estimate(frame_id)
 
     def _update(
@@ -263,10 +258,10 @@ class PoseGraph:
             return
         n_steps = 0
         while n_steps < _MAX_STEPS and not np.abs(self._isam.getDelta().vector()).max() < _FAR:
-            self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), *constraints)
+            self._isam.update(_graph_of(), gtsam.Values(), *constraints)
             n_steps += 1
         if n_steps > 0:
-            _check(gtsam.utilities.extractPose3(self._isam.calculateEstimate()))
+            check_places(gtsam.utilities.extractPose3(self._isam.calculateEstimate()))
 
     def _constraints(self, last: Sequence[int], leaving: Sequence[int]) -> tuple[Any, ...]:
         """Return the arguments of an update that make leaving poses leaves of the Bayes tree.
@@ -276,11 +271,13 @@ class PoseGraph:
         if not leaving:
             return ()
         n_leaving = len(leaving)
-        groups = dict.fromkeys((pose.key for pose in self.poses.values()), n_leaving)
+        groups = {}
+        for pose in self.poses.values():
+            groups[pose.key] = n_leaving
         # The poses that the factors constrain come last: their covariances are cheap then, and
         # the next pose usually has edges to the same ones.
-        groups |= dict.fromkeys(last, n_leaving + 1)
-        groups |= {key: group for group, key in enumerate(leaving)}
+        groups.update(dict.fromkeys(last, n_leaving + 1))
+        groups.update(zip(leaving, range(n_leaving), strict=True))
         constrained, reeliminate = gtsam.KeyGroupMap(), gtsam.KeyList()
         for key, group in groups.items():
             constrained.insert2(key, group)
@@ -362,7 +359,7 @@ class PoseGraph:
     def _estimate(self, frame_id: FrameId) -> Estimate:
         pose = self.poses[frame_id]
         T_world_frame = self._pose(pose.key)
-        _check(T_world_frame)
+        check_places(T_world_frame)
         return Estimate(
             stamp_ns=pose.stamp_ns,
             T_world_frame=T_world_frame,
@@ -395,17 +392,27 @@ class PoseGraph:
     def measurements(self) -> list[GraphEdge]:
         """Return the measurements between poses of the window, with their residuals."""
         values, found = self._isam.calculateEstimate(), []
-        for frame_id, pose in self.poses.items():
-            for edge, factor in self.current_edges(pose):
-                measured = edge.reference_id, edge.T_reference_frame, edge.covariance
-                found.append(_graph_edge(frame_id, *measured, factor, values))
-            for prior, factor in pose.priors:
-                if isinstance(prior, PosePrior):
-                    T = prior.T_world_frame
-                else:
-                    T = se3.make_transform(self._pose(pose.key)[:3, :3], prior.position_world)
-                found.append(_graph_edge(frame_id, None, T, prior.covariance, factor, values))
+        for frame_id in self.poses:
+            for measured, factor in self.measurements_of(frame_id):
+                residual, weight = residual_of(factor, values)
+                found.append(
+                    GraphEdge(
+                        reference_id=measured.reference_id if isinstance(measured, Edge) else None,
+                        frame_id=frame_id,
+                        T_reference_frame=self._measured_pose(frame_id, measured),
+                        covariance=measured.covariance,
+                        residual=residual,
+                        weight=weight,
+                    )
+                )
         return found
+
+    def _measured_pose(self, frame_id: FrameId, measured: Edge | Prior) -> FloatArray:
+        if isinstance(measured, Edge):
+            return measured.T_reference_frame
+        if isinstance(measured, PosePrior):
+            return measured.T_world_frame
+        return se3.make_transform(self.pose(frame_id)[:3, :3], measured.position_world)
 
     def keep_causal(self, estimate: Estimate) -> None:
         """Keep the causal estimate of a pose; it is final if the pose is not in the graph."""
@@ -446,25 +453,8 @@ def absence(frame_id: FrameId) -> str:
     return f"{frame_id!r} is not in the window: it has left, or never was"
 
 
-def _check(poses: FloatArray) -> None:
-    if fault := place_fault(poses):
-        raise RuntimeError(fault)
-
-
-def _graph_edge(
-    frame_id: FrameId,
-    reference_id: FrameId,
-    T_reference_frame: FloatArray,
-    covariance: FloatArray,
-    factor: gtsam.NoiseModelFactor,
-    values: gtsam.Values,
-) -> GraphEdge:
-    residual, weight = residual_of(factor, values)
-    return GraphEdge(
-        reference_id=reference_id,
-        frame_id=frame_id,
-        T_reference_frame=T_reference_frame,
-        covariance=covariance,
-        residual=residual,
-        weight=weight,
-    )
+def _graph_of(*factors: gtsam.NonlinearFactor) -> gtsam.NonlinearFactorGraph:
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in factors:
+        graph.add(factor)
+    return graph

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
@@ -15,7 +15,7 @@ import numpy as np
 
 from gvo.backend.batch import BatchResult
 from gvo.backend.factors import ORIGIN, Measurement, find_faults, prior_fault
-from gvo.backend.gating import Prediction, disagreement, gate_edges
+from gvo.backend.gating import Gated, Prediction, disagreement, gate_edges
 from gvo.backend.keyframe_policy import choose_released, is_needed, proximity
 from gvo.backend.motion_model import ConstantVelocity, StatusClock
 from gvo.backend.pose_graph import NewPose, PoseGraph, absence
@@ -269,13 +269,7 @@ class SlidingWindow:
         fault = "" if pose else absence(frame_id)
         fault = self._absence(frame_id, edge) or fault or find_faults([edge])[0]
         gated = "" if fault else self._gate_loop(frame_id, edge)
-        if fault or gated:
-            return self._reject(frame_id, fault or gated, edge=edge, is_gated=bool(gated))
-        answer = self._try(lambda: self._graph.add_edge(frame_id, edge), frame_id, edge=edge)
-        if isinstance(answer, Rejected):
-            return answer
-        self._counted["n_edges"] += 1
-        return self._scaled(answer)
+        return self._extend(frame_id, edge, fault or gated, is_gated=bool(gated))
 
     def add_prior(self, frame_id: FrameId, prior: Prior) -> Estimate | Rejected:
         """Add a measurement of a pose of the window in the world.
@@ -292,14 +286,7 @@ class SlidingWindow:
         """
         _check_prior(frame_id, prior)
         is_there = self._graph.find(frame_id) is not None
-        fault = prior_fault(prior) if is_there else absence(frame_id)
-        if fault:
-            return self._reject(frame_id, fault)
-        answer = self._try(lambda: self._graph.add_prior(frame_id, prior), frame_id)
-        if isinstance(answer, Rejected):
-            return answer
-        self._counted["n_priors"] += 1
-        return self._scaled(answer)
+        return self._extend(frame_id, prior, prior_fault(prior) if is_there else absence(frame_id))
 
     def keep(self, frame_id: FrameId) -> None:
         """Keep a pose in the window until it is released."""
@@ -324,10 +311,10 @@ class SlidingWindow:
 
     def edges(self, frame_id: FrameId) -> tuple[Edge, ...]:
         """Return the accepted edges of a frame to poses of the window; empty if it has left."""
-        pose = self._poses.get(frame_id)
-        if pose is None:
+        if frame_id not in self._poses:
             return ()
-        return tuple(edge for edge, _ in self._graph.current_edges(pose))
+        found = (measured for measured, _ in self._graph.measurements_of(frame_id))
+        return tuple(measured for measured in found if isinstance(measured, Edge))
 
     def stamp_ns(self, frame_id: FrameId) -> int:
         """Return the stamp of a pose of the window, nanoseconds."""
@@ -407,13 +394,10 @@ class SlidingWindow:
     def _check_new(
         self, frame_id: FrameId, stamp_ns: int, edges: Sequence[Edge], prior: Prior | None
     ) -> None:
-        is_known = self._graph.find(frame_id) is not None
-        if frame_id is None or is_known:
-            raise ValueError(
-                f"{frame_id!r} is in the window already"
-                if is_known
-                else "a frame_id must not be None"
-            )
+        if frame_id is None:
+            raise ValueError("a frame_id must not be None")
+        if self._graph.find(frame_id) is not None:
+            raise ValueError(f"{frame_id!r} is in the window already")
         if isinstance(stamp_ns, bool) or not isinstance(stamp_ns, int | np.integer):
             raise ValueError(f"stamp_ns of {frame_id!r} must be an int, got {stamp_ns!r}")
         last = self._motion.last
@@ -438,15 +422,6 @@ class SlidingWindow:
         if self.variance_factor == 1.0:
             return estimate
         return replace(estimate, covariance=self.variance_factor * estimate.covariance)
-
-    def _reject(
-        self, frame_id: FrameId, reason: str, *, edge: Edge | None = None, is_gated: bool = False
-    ) -> Rejected:
-        pose = self._poses.get(frame_id)
-        rejected = _refusal(frame_id, None if pose is None else pose.stamp_ns, edge, reason)
-        self._counted["n_gated"] += int(is_gated)
-        self._count_rejected([rejected])
-        return rejected
 
     def _count(self, new: NewPose) -> None:
         self._counted["n_poses"] += 1
@@ -476,14 +451,7 @@ class SlidingWindow:
                 refused.append((edge, fault))
             else:
                 predictions.append(self._predict(edge))
-        if not predictions:
-            return self._unmeasured(frame_id, stamp_ns, prior, refused)
-        gated = gate_edges(
-            predictions,
-            relative_covariance=self._graph.relative_covariance,
-            motion=lambda: self._coast(stamp_ns),
-            gate=self._config.gate,
-        )
+        gated, support = self._gate(predictions, stamp_ns, prior)
         refused += gated.refused
         return NewPose(
             frame_id=frame_id,
@@ -491,10 +459,26 @@ class SlidingWindow:
             T_world_start=gated.T_world_start,
             measurements=gated.accepted,
             prior=prior,
+            support=support,
             rejected=tuple(_refusal(frame_id, stamp_ns, *each) for each in refused),
             n_gated=len(gated.refused),
             misfit=gated.misfit,
         )
+
+    def _gate(
+        self, predictions: Sequence[Prediction], stamp_ns: int, prior: Prior | None
+    ) -> tuple[Gated, Edge | PosePrior | None]:
+        """Gate edges against each other; without any, return what constrains the pose instead."""
+        if not predictions:
+            T_world_start, support = self._start(stamp_ns, prior)
+            return Gated(T_world_start, [], [], math.nan), support
+        gated = gate_edges(
+            predictions,
+            relative_covariance=self._graph.relative_covariance,
+            motion=lambda: self._coast(stamp_ns),
+            gate=self._config.gate,
+        )
+        return gated, None
 
     def _absence(self, frame_id: FrameId, edge: Edge) -> str:
         """Say why the reference of an edge cannot be one; empty if it can."""
@@ -522,30 +506,16 @@ class SlidingWindow:
             )
         )
 
-    def _unmeasured(
-        self,
-        frame_id: FrameId,
-        stamp_ns: int,
-        prior: Prior | None,
-        refused: Sequence[tuple[Edge | None, str]],
-    ) -> NewPose:
-        """Return a pose without edges; it continues the last velocity if nothing else is known."""
-        support: Edge | PosePrior | None = None
+    def _start(
+        self, stamp_ns: int, prior: Prior | None
+    ) -> tuple[gtsam.Pose3, Edge | PosePrior | None]:
+        """Return where a pose without edges begins, and what constrains it there."""
         if isinstance(prior, PosePrior):
-            T_world_start = gtsam.Pose3(prior.T_world_frame)
-        elif (coasted := self._coast(stamp_ns)) is not None:
-            support, T_world_start = coasted.edge, coasted.T_world_frame
-        else:
-            support = self._support(stamp_ns, prior)
-            T_world_start = gtsam.Pose3(support.T_world_frame)
-        return NewPose(
-            frame_id=frame_id,
-            stamp_ns=stamp_ns,
-            T_world_start=T_world_start,
-            prior=prior,
-            support=support,
-            rejected=tuple(_refusal(frame_id, stamp_ns, *each) for each in refused),
-        )
+            return gtsam.Pose3(prior.T_world_frame), None
+        if (coasted := self._coast(stamp_ns)) is not None:
+            return coasted.T_world_frame, coasted.edge
+        support = self._support(stamp_ns, prior)
+        return gtsam.Pose3(support.T_world_frame), support
 
     def _support(self, stamp_ns: int, prior: PositionPrior | None) -> PosePrior:
         """Return where a pose begins that no pose of the window leads to."""
@@ -582,23 +552,39 @@ class SlidingWindow:
 
     def _refuse_all(self, new: NewPose) -> NewPose:
         """Return the pose without measurements."""
-        refused: list[Edge | None] = [measurement.edge for measurement in new.measurements]
-        refused += [] if new.prior is None else [None]
-        reason = "GTSAM gave up on the update"
-        alone = self._unmeasured(
-            new.frame_id, new.stamp_ns, None, [(edge, reason) for edge in refused]
+        edges: list[Edge | None] = [measurement.edge for measurement in new.measurements]
+        edges += [] if new.prior is None else [None]
+        ends, reason = (new.frame_id, new.stamp_ns), "GTSAM gave up on the update"
+        T_world_start, support = self._start(new.stamp_ns, None)
+        return replace(
+            new,
+            T_world_start=T_world_start,
+            measurements=(),
+            prior=None,
+            support=support,
+            rejected=(*new.rejected, *(_refusal(*ends, edge, reason) for edge in edges)),
+            misfit=math.nan,
         )
-        return replace(alone, rejected=new.rejected + alone.rejected, n_gated=new.n_gated)
 
-    def _try(
-        self, extend: Callable[[], Estimate], frame_id: FrameId, *, edge: Edge | None = None
+    def _extend(
+        self, frame_id: FrameId, measured: Edge | Prior, fault: str, *, is_gated: bool = False
     ) -> Estimate | Rejected:
-        """Return the estimate after another measurement, or why GTSAM failed."""
-        try:
-            return extend()
-        except SmoothingError as error:
-            self._note_failure(repr(frame_id), error)
-            return self._reject(frame_id, f"GTSAM gave up on the update: {error}", edge=edge)
+        """Add a measurement of a pose of the window that has no fault."""
+        edge = measured if isinstance(measured, Edge) else None
+        if not fault:
+            try:
+                estimate = self._graph.extend(frame_id, measured)
+            except SmoothingError as error:
+                self._note_failure(repr(frame_id), error)
+                fault = f"GTSAM gave up on the update: {error}"
+            else:
+                self._counted["n_priors" if edge is None else "n_edges"] += 1
+                return self._scaled(estimate)
+        pose = self._poses.get(frame_id)
+        rejected = _refusal(frame_id, None if pose is None else pose.stamp_ns, edge, fault)
+        self._counted["n_gated"] += int(is_gated)
+        self._count_rejected([rejected])
+        return rejected
 
     def _note_failure(self, place: str, error: SmoothingError) -> None:
         self._counted["n_restored"] += 1
