@@ -33,10 +33,8 @@ from scipy.stats import binomtest
 
 ROOT = Path(__file__).resolve().parents[2]
 PATHS = ("gvo/geometry", "gvo/backend", "gvo/kernels", "gvo/trajectory", "gvo/io/sync.py")
-TESTS = (
-    *("tests/geometry", "tests/backend", "tests/kernels", "tests/trajectory"),
-    *("tests/io/test_sync.py", "tests/io/test_sync_reference.py"),
-)
+TESTS = [f"tests/{room}" for room in ("geometry", "backend", "kernels", "trajectory")]
+TESTS += ["tests/io/test_sync.py", "tests/io/test_sync_reference.py"]
 MIN_KILLED, UNUSABLE = 0.9, 3
 SPARE_S, PATIENCE = 5.0, 10.0
 
@@ -203,8 +201,7 @@ class Mutation:
     survivors: list[Mutant] = field(default_factory=list)
     n_run: int = 0
     failed: bool = False
-    reason: str = ""
-    failing_test: str | None = None  # without a mutant, and why
+    reason: str = ""  # why a test fails without a mutant
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         if report.failed:
@@ -218,7 +215,7 @@ class Mutation:
                 _hush()
                 self._measure(session, answer)
             if os.waitpid(pid, 0)[1]:
-                self.failing_test = answer.read_text() if answer.exists() else "a fork of pytest"
+                self.reason = answer.read_text() if answer.exists() else "all of them"
                 return True
             seconds, reached = json.loads(answer.read_text())
         gc.freeze()  # so that forks share what is there
@@ -235,10 +232,7 @@ class Mutation:
         return True
 
     def _measure(self, session: pytest.Session, answer: Path) -> None:
-        """Run all tests once; write down how long each takes and which lines it reaches.
-
-        The process ends, with 1 where a test failed; then its name and reason are written down.
-        """
+        """Write down how long each test takes and which lines it reaches, or which one fails."""
         files = sorted({str(mutant.path) for mutant in self.mutants})
         tracer = coverage.Coverage(data_file=None, config_file=False, include=files)
         tracer.start()
@@ -247,10 +241,7 @@ class Mutation:
         for index, following in zip_longest(indices, indices[1:]):
             tracer.switch_context(str(index))
             start = time.process_time()
-            try:
-                _run_test(session, index, following)
-            except BaseException as error:  # noqa: BLE001 - as pytest.exit or an interrupt
-                self.failed, self.reason = True, repr(error)
+            self._run_test(session, index, following)
             seconds.append(time.process_time() - start)
             if self.failed:
                 answer.write_text(f"{session.items[index].nodeid}: {self.reason}")
@@ -261,6 +252,14 @@ class Mutation:
         answer.write_text(json.dumps([seconds, reached]))
         os._exit(0)
 
+    def _run_test(self, session: pytest.Session, index: int, following: int | None) -> None:
+        item = session.items[index]
+        next_item = None if following is None else session.items[following]
+        try:
+            item.ihook.pytest_runtest_protocol(item=item, nextitem=next_item)
+        except BaseException as error:  # noqa: BLE001 - as pytest.exit or an interrupt
+            self.failed, self.reason = True, repr(error)
+
     def _fork(
         self, mutant: Mutant, session: pytest.Session, tests: list[int], seconds: list[float]
     ) -> int:
@@ -268,18 +267,19 @@ class Mutation:
         pid = os.fork()
         if pid:
             return pid
+        _hush()
+        signal.signal(signal.SIGPROF, signal.SIG_DFL)
         try:
-            _hush()
-            signal.signal(signal.SIGPROF, signal.SIG_DFL)
-            if not install(mutant):
-                os._exit(UNUSABLE)
-            for test, following in zip_longest(tests, tests[1:]):
-                signal.setitimer(signal.ITIMER_PROF, SPARE_S + PATIENCE * seconds[test])
-                _run_test(session, test, following)
-                if self.failed:
-                    break
-        except BaseException:  # noqa: BLE001 - as pytest.exit or an interrupt: noticed
-            self.failed = True
+            is_usable = install(mutant)
+        except (KeyError, SyntaxError, ValueError):
+            is_usable = False
+        if not is_usable:
+            os._exit(UNUSABLE)
+        for test, following in zip_longest(tests, tests[1:]):
+            signal.setitimer(signal.ITIMER_PROF, SPARE_S + PATIENCE * seconds[test])
+            self._run_test(session, test, following)
+            if self.failed:
+                break
         os._exit(int(self.failed))
 
     def _await(self, running: dict[int, Mutant]) -> None:
@@ -307,12 +307,6 @@ def install(mutant: Mutant) -> bool:
     for function in functions:
         function.__code__ = codes[function.__code__.co_firstlineno]
     return bool(functions)
-
-
-def _run_test(session: pytest.Session, index: int, following: int | None) -> None:
-    item = session.items[index]
-    next_item = None if following is None else session.items[following]
-    item.ihook.pytest_runtest_protocol(item=item, nextitem=next_item)
 
 
 def _codes(code: CodeType, name: str) -> Iterator[CodeType]:
@@ -349,10 +343,9 @@ def main() -> int:
     with Path(os.devnull).open("w") as nothing, redirect_stdout(nothing):
         code = pytest.main([*options, *tests], plugins=[mutation])
     if mutation.n_run == 0:
-        reason = f"without a mutant this test fails: {mutation.failing_test}"
-        if mutation.failing_test is None:
-            reason = f"no mutant could be run (pytest ended with {int(code)})"
-        print(f"mutation: {reason}", file=sys.stderr)
+        failing = f"without a mutant this fails: {mutation.reason}"
+        nothing = f"no mutant could be run (pytest ended with {int(code)})"
+        print(f"mutation: {failing if mutation.reason else nothing}", file=sys.stderr)
         return 2
     n_killed = mutation.n_run - len(mutation.survivors)
     low, high = binomtest(n_killed, mutation.n_run).proportion_ci(method="wilson")
