@@ -81,7 +81,7 @@ class RunGraph:
         # By the stamps of both ends, the earlier one first; and which frames are tied to which.
         self._edges: dict[tuple[int, int], list[Edge]] = {}
         self._neighbours: dict[int, set[int]] = {}
-        # Frames of the graph that are no keyframes, oldest first.
+        # Frames of the graph that are no places, oldest first.
         self._passing: deque[int] = deque()
         self._measured_ns = 0
         self.loops: Sequence[Loop] = ()
@@ -166,7 +166,7 @@ class RunGraph:
         parts.add(stamp_ns)
         if not by_part:
             return
-        newest = max(edges, key=lambda edge: source_ns(edge))
+        newest = max(edges, key=source_ns)
         path.connect(source_ns(newest), stamp_ns, newest.covariance)
         first = min(by_part)
         home = by_part.pop(first)
@@ -200,6 +200,8 @@ class RunGraph:
             ends = min(other_ns, stamp_ns), max(other_ns, stamp_ns)
             tie = fuse(self._edges.pop(ends))
             ties[other_ns] = inverse(tie, other_ns) if other_ns > stamp_ns else tie
+        if not ties:  # all that it was tied to was merged into it
+            return
         hub_ns = min(ties, key=lambda ns: float(np.trace(ties[ns].covariance[3:, 3:])))
         hub = ties.pop(hub_ns)
         hub = replace(hub, covariance=max(len(ties), 1) * hub.covariance)

@@ -68,6 +68,8 @@ class _Links(NamedTuple):
     is_joining: bool = False
 
 
+# Of another part so many times fewer keyframes wait to be seen again: each costs time.
+_WAITING = 2
 # Of the misclosures that a variance factor is averaged over: errors that last do not show at once.
 _MIN_LOOP_NS = 300_000_000
 
@@ -481,7 +483,8 @@ class Odometry:
         config, unjoined = self._config.window, self._map.unjoined_ns
         n_over = len(self._keyframes) - len(unjoined) - config.n_keyframes
         released = choose_unseen(scores, self._keyframes.n_unseen(n_steps), max(n_over, 0))
-        for stamp_ns in released + unjoined[: max(len(unjoined) - config.n_keyframes, 0)]:
+        n_waiting = max(config.n_keyframes // _WAITING, 1)
+        for stamp_ns in released + unjoined[: max(len(unjoined) - n_waiting, 0)]:
             self._keyframes.drop(stamp_ns)
             self._window.release(stamp_ns)
         for stamp_ns in self._keyframes.stamps_ns:

@@ -303,3 +303,14 @@ def test_a_graph_that_begins_later_leaves_out_what_was_before() -> None:
         pose = estimate_at(j * PERIOD_NS, whole.truth[j])
         later.add_frame(pose, whole.edges[j], is_place=j % 5 == 0)
     np.testing.assert_allclose(poses(later.optimize()), whole.truth[10:30], atol=1e-9)
+
+
+def test_pairs_of_frames_that_nothing_else_connects_are_merged_and_placed() -> None:
+    truth = np.array([se3.exp(np.array([0, 0, 0, 0, 0, 0.1 * j])) for j in range(400)])
+    graph = RunGraph(WindowConfig(), max_frames=10)
+    for j in range(400):
+        edges = [measured(truth, j - 1, j, SIGMAS, None)] if j % 2 or j > 390 else []
+        graph.add_frame(estimate_at(j * PERIOD_NS, truth[j]), edges, is_place=j > 390)
+    assert len(graph) < 320
+    graph.loops = [Drive(truth).loop(392, 399)]
+    np.testing.assert_allclose(poses(graph.optimize()), truth, atol=1e-6)
