@@ -6,7 +6,7 @@ import numpy as np
 
 from gvo.config import WindowConfig
 from gvo.geometry import se3
-from gvo.types import Estimate, FloatArray, FrameId, Status
+from gvo.types import Edge, Estimate, FloatArray, FrameId, PosePrior, Status
 
 # After a longer gap the last velocity is no longer extrapolated.
 MAX_EXTRAPOLATION_S = 1.0
@@ -67,13 +67,9 @@ class StatusClock:
     """
 
     def __init__(self, lost_after_s: float) -> None:
-        self._lost_after_s = lost_after_s
+        self.lost_after_s = lost_after_s
         self._measured_ns: int | None = None
         self._has_none = False
-
-    def reconfigure(self, lost_after_s: float) -> None:
-        """Set another limit."""
-        self._lost_after_s = lost_after_s
 
     def next(self, stamp_ns: int, *, is_measured: bool) -> Status:
         """Return the status of the next frame.
@@ -91,7 +87,7 @@ class StatusClock:
             return Status.RESUMED if had_none else Status.OK
         self._measured_ns = stamp_ns if self._measured_ns is None else self._measured_ns
         coasting_s = 1e-9 * (stamp_ns - self._measured_ns)
-        return Status.LOST if coasting_s > self._lost_after_s else Status.COASTING
+        return Status.LOST if coasting_s > self.lost_after_s else Status.COASTING
 
 
 class ConstantVelocity:
@@ -104,7 +100,7 @@ class ConstantVelocity:
     """
 
     def __init__(self, config: WindowConfig) -> None:
-        self._config = config
+        self.config = config
         self.restart()
 
     def restart(self) -> None:
@@ -112,10 +108,6 @@ class ConstantVelocity:
         self._measured: Estimate | None = None
         self._step: tuple[FloatArray, FloatArray, float] | None = None
         self.last: Estimate | None = None
-
-    def reconfigure(self, config: WindowConfig) -> None:
-        """Set other sigmas."""
-        self._config = config
 
     @property
     def measured_id(self) -> FrameId:
@@ -145,26 +137,32 @@ class ConstantVelocity:
             self._step = T_world_measured, estimate.T_world_frame, elapsed_s
         self._measured = estimate
 
-    def predict_step(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
-        """Return T_last_frame, shape (4, 4), of a later frame, and its covariance (6, 6)."""
-        if self.last is None:
-            return predict_step(None, 0.0, self._config)
-        measured_ns = (self._measured or self.last).stamp_ns
-        return predict_step(
-            self._velocity(),
-            1e-9 * (stamp_ns - self.last.stamp_ns),
-            self._config,
-            coasted_s=1e-9 * (self.last.stamp_ns - measured_ns),
-        )
-
-    def predict_pose(self, stamp_ns: int) -> tuple[FloatArray, FloatArray] | None:
-        """Return T_world_frame of a later frame, and its covariance; None without a last pose."""
+    def predict(self, stamp_ns: int) -> Edge | None:
+        """Return the edge from the last frame to a later one; None without a last one."""
         if self.last is None:
             return None
-        T_last_frame, covariance = self.predict_step(stamp_ns)
-        return (
-            se3.normalize(self.last.T_world_frame @ T_last_frame),
-            se3.compose_covariance(self.last.covariance, T_last_frame, covariance),
+        measured_ns = (self._measured or self.last).stamp_ns
+        T_last_frame, covariance = predict_step(
+            self._velocity(),
+            1e-9 * (stamp_ns - self.last.stamp_ns),
+            self.config,
+            coasted_s=1e-9 * (self.last.stamp_ns - measured_ns),
+        )
+        return Edge(
+            reference_id=self.last.frame_id,
+            T_reference_frame=T_last_frame,
+            covariance=covariance,
+            kernel="none",
+        )
+
+    def predict_pose(self, stamp_ns: int) -> PosePrior | None:
+        """Return where a later frame is in the world; None without a last one."""
+        if self.last is None or (edge := self.predict(stamp_ns)) is None:
+            return None
+        T = edge.T_reference_frame
+        return PosePrior(
+            T_world_frame=se3.normalize(self.last.T_world_frame @ T),
+            covariance=se3.compose_covariance(self.last.covariance, T, edge.covariance),
         )
 
     def _velocity(self) -> FloatArray | None:

@@ -189,8 +189,8 @@ class SlidingWindow:
             return
         self._config = config
         self._graph.reconfigure(config)
-        self._clock.reconfigure(config.lost_after_s)
-        self._motion.reconfigure(config)
+        self._clock.lost_after_s = config.lost_after_s
+        self._motion.config = config
 
     def add_pose(
         self,
@@ -493,18 +493,10 @@ class SlidingWindow:
 
     def _coast(self, stamp_ns: int) -> Prediction | None:
         """Return the edge that the last velocity predicts; None if the last pose has left."""
-        last = self._motion.last
-        if last is None or last.frame_id not in self._poses:
+        edge = self._motion.predict(stamp_ns)
+        if edge is None or edge.reference_id not in self._poses:
             return None
-        T_last_frame, covariance = self._motion.predict_step(stamp_ns)
-        return self._predict(
-            Edge(
-                reference_id=last.frame_id,
-                T_reference_frame=T_last_frame,
-                covariance=covariance,
-                kernel="none",
-            )
-        )
+        return self._predict(edge)
 
     def _start(
         self, stamp_ns: int, prior: Prior | None
@@ -519,8 +511,8 @@ class SlidingWindow:
 
     def _support(self, stamp_ns: int, prior: PositionPrior | None) -> PosePrior:
         """Return where a pose begins that no pose of the window leads to."""
-        if (prediction := self._motion.predict_pose(stamp_ns)) is not None:
-            return PosePrior(T_world_frame=prediction[0], covariance=prediction[1])
+        if (predicted := self._motion.predict_pose(stamp_ns)) is not None:
+            return predicted
         if prior is None:
             return ORIGIN
         T_world_start = se3.make_transform(np.eye(3), prior.position_world)

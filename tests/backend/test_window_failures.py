@@ -23,7 +23,6 @@ from tests.backend.twins import (
     NEWEST,
     POSE_PRIOR,
     POSITION_PRIOR,
-    Act,
     N,
     Run,
     assert_as_twin,
@@ -163,32 +162,6 @@ def test_what_interrupts_an_update_is_passed_on_and_leaves_the_window_as_it_was(
 
     config = WindowConfig(size=size)
     assert_as_twin(run(act, config=config), run(config=config))
-
-
-@pytest.mark.parametrize(
-    "act",
-    [
-        lambda window: window.add_edge(NEWEST, good_edges()[NEWEST][0]),
-        lambda window: window.add_prior(NEWEST, POSITION_PRIOR),
-        lambda window: window.add_prior(NEWEST, POSE_PRIOR),
-    ],
-    ids=["an edge", "a position", "a pose"],
-)
-def test_an_edge_or_a_prior_at_which_gtsam_fails_is_refused_and_leaves_no_trace(act: Act) -> None:
-    def act_and_fail(window: SlidingWindow) -> object:
-        before = window.poses()
-        with failing("update", TWICE) as seen:
-            answer = act(window)
-        assert seen == [0, 1, 2, 3]
-        for name, pose in window.poses().items():
-            np.testing.assert_allclose(pose, before[name], rtol=0, atol=1e-12)
-        return answer
-
-    found = run(act_and_fail)
-    assert isinstance(found.answer, Rejected)
-    assert found.answer.frame_id == NEWEST
-    assert_as_twin(found, plain_twin())
-    assert found.window.counts.n_restored == 1
 
 
 def test_a_batch_optimization_that_fails_leaves_the_estimates_as_they_were(
