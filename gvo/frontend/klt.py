@@ -57,14 +57,6 @@ _DISPARITY_SIGMA_PX = 0.15
 _N_TRACK_STEPS = 4
 # An alignment that ends farther from its track was of something else.
 _MAX_ALIGN_PX = 3.0
-# Share of the points in view that an alignment from the prediction has to confirm, times the share
-# of those that came to rest.
-_MIN_SHARE_ALIGNED = 0.1
-# Tracks that are tried first where an alignment confirms little, and the share of them to be found:
-# where the prediction was 8 px off, and all were found in the end, 0.18 at least and mostly more
-# than 0.35; of keyframes asked in vain 0.13, and seldom more than 0.3.
-_N_SAMPLED = 40
-_MIN_SHARE_TRACKED = 0.25
 # Patches of a place are described in another size too: it is seen again from farther, or nearer.
 _WIDE = 1.5
 # By how much more corners of a lost camera are looked for.
@@ -184,7 +176,7 @@ class KltFrontend:
         if prior is None:
             return self._register_widely(reference, current, None)
         if prior.T_recent is None:
-            result = self._register_keyframe(prior, reference, current)
+            result = self._register_link(prior, reference, current)
         else:
             result = self._register_step(prior, reference, current, "near")
             if not isinstance(result, RelativePose | Contradiction):
@@ -192,41 +184,6 @@ class KltFrontend:
         if prior.is_confirmed:
             return result
         return check_view(result, reference.points_cam, self.camera)
-
-    def _register_keyframe(
-        self, prior: MotionPrior, reference: KltObservations, current: KltObservations
-    ) -> RelativePose | Failure:
-        """Register by alignment alone, and by tracks too where that confirms few points in view.
-
-        Patches that are aligned where they were expected cannot tell that the prediction is far
-        off: then few come to rest, or they disagree. But the view may as well have changed: then
-        a sample of tracks is not found either.
-        """
-        frames = reference, current
-        expected = self.predict(prior.T_predicted, *frames)
-        aligned = self._register_link(prior, *frames, expected, "aligned")
-        if isinstance(aligned, Contradiction):
-            return aligned
-        if isinstance(aligned, RelativePose):
-            n_confirmed = aligned.n_inliers**2 / (_MIN_SHARE_ALIGNED * aligned.n_matches)
-            if n_confirmed >= len(expected.indices):
-                return aligned
-        if not self._is_seen_again(*frames, expected):
-            return aligned
-        tracked = self._register_link(prior, *frames, expected, "near")
-        if isinstance(aligned, Failure):
-            return tracked
-        is_more = isinstance(tracked, RelativePose) and tracked.n_inliers > aligned.n_inliers
-        return tracked if is_more else aligned
-
-    def _is_seen_again(
-        self, reference: KltObservations, current: KltObservations, expected: Expected
-    ) -> bool:
-        """Tell whether enough of a sample of the points in view are tracked."""
-        n = len(expected.indices)
-        sample = expected.take(np.arange(0, n, n // _N_SAMPLED + 1))
-        _, is_tracked = self.find_tracks(reference, current, sample, "near")
-        return bool(np.count_nonzero(is_tracked) >= _MIN_SHARE_TRACKED * len(is_tracked))
 
     def _register_widely(
         self, reference: KltObservations, current: KltObservations, prior: MotionPrior | None
@@ -303,8 +260,7 @@ class KltFrontend:
         if isinstance(rough, Failure):
             return rough
         prior = MotionPrior(T_predicted=rough.T_reference_current)
-        expected = self.predict(prior.T_predicted, reference, observations)
-        result = self._register_link(prior, reference, observations, expected, "aligned")
+        result = self._register_link(prior, reference, observations)
         points, frame = reference.depth_points, observations.frame
         checked = self._check_view(result, reference, points, frame)
         if isinstance(checked, Failure) or points is None or not isinstance(frame, RgbdFrame):
@@ -393,15 +349,11 @@ class KltFrontend:
         return self._track(reference, current, expected, "wide" if is_wide else "near")
 
     def _register_link(
-        self,
-        prior: MotionPrior,
-        reference: _Reference,
-        current: KltObservations,
-        expected: Expected,
-        search: _Search,
+        self, prior: MotionPrior, reference: _Reference, current: KltObservations
     ) -> RelativePose | Failure:
-        """Track expected corners, measure in 3-D, register; velocities stay as they are."""
-        measured = self._track(reference, current, expected, search)
+        """Align corners where they are expected, measure, register; velocities stay as they are."""
+        expected = self.predict(prior.T_predicted, reference, current)
+        measured = self._track(reference, current, expected, "aligned")
         return self.calibrated.register(measured, self._config, prior=prior, is_step=False)
 
     def _sigmas(self, n: int) -> tuple[FloatArray, FloatArray]:

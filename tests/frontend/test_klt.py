@@ -14,7 +14,6 @@ from gvo.frontend.descriptor import DescriptorFrontend
 from gvo.frontend.factory import make_frontend
 from gvo.frontend.klt import KltFrontend, KltObservations
 from gvo.frontend.registration import check_view
-from gvo.frontend.tracking import track_pixels
 from gvo.geometry import se3
 from gvo.io.recording import Sensor
 from gvo.types import Failure, FloatArray, Frame, MotionPrior, RelativePose, RgbdFrame, StereoFrame
@@ -68,7 +67,7 @@ def test_the_points_lie_on_the_surfaces(sensor: Sensor) -> None:
 
 
 def expect(T: FloatArray | None) -> MotionPrior | None:
-    return None if T is None else MotionPrior(T_predicted=T)
+    return None if T is None else MotionPrior(T_predicted=T, T_recent=T)
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
@@ -319,27 +318,3 @@ def test_depth_that_contradicts_a_place_is_no_place() -> None:
     result = klt.recognize(klt.describe(first), klt.describe(pierced), pierced)
     assert isinstance(result, Failure)
     assert "free space" in result.reason
-
-
-@pytest.mark.parametrize("is_same_place", [True, False])
-def test_of_a_keyframe_that_is_not_seen_again_only_a_sample_is_tracked(
-    is_same_place: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    n_tracked = []
-
-    def spy(images: Any, pixels: FloatArray, *rest: Any, **options: Any) -> Any:
-        n_tracked.append(len(pixels))
-        return track_pixels(images, pixels, *rest, **options)
-
-    for module in ("klt", "tracking"):
-        monkeypatch.setattr(f"gvo.frontend.{module}.track_pixels", spy)
-    reference, frame = observations("rgbd")[0], frames("rgbd")[1]
-    assert isinstance(frame, RgbdFrame)
-    if not is_same_place:
-        frame = replace(frame, image=frame.image[::-1].copy())
-    klt = frontend("rgbd")
-    prior = MotionPrior(T_predicted=wrong(true_motion("rgbd", 0, 1), 0.02))
-    result = klt.register(reference, klt.extract(frame), prior)
-    assert isinstance(result, RelativePose) == is_same_place
-    assert 20 < n_tracked[0] <= 40
-    assert [n > 100 for n in n_tracked[1:]] == [True] * is_same_place
