@@ -35,7 +35,6 @@ from gvo.geometry.residuals import (
     HUBER,
     Linearization,
     StereoResiduals,
-    pose_jacobian,
     whiten_in_place,
 )
 from gvo.types import BoolArray, ConstantError, Failure, FloatArray
@@ -47,9 +46,6 @@ GATE = 3.0
 _N_ITERATIONS = 10
 # Squared length of a step, in sigmas, that no longer matters.
 _CONVERGED = 1e-3
-# Root mean square change of the residuals in sigmas, about a pixel, up to which the Jacobian is
-# reused: it is still right to a hundredth.
-_SHORT = 1.0
 # Variance inflation of a parameter above which a direction of motion is unobservable.
 _MAX_INFLATION = 1e10
 # Lower bound of the noise scale: two copies of one image, which recordings do hold, fit exactly
@@ -214,7 +210,7 @@ def adjust(
         Inflation of the matches' sigmas, relative to what is known of the constants.
     """
     T = T_target_source
-    J_constants, _ = residuals.sensitivities(T, residuals.source_points)
+    J_constants, _ = residuals.sensitivities(T)
     k, weight = len(J_constants), sigma_factor**2
     values, H = np.zeros(k), np.eye(6 + k)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -260,11 +256,9 @@ def fit_covariance(
 def _gauss_newton(
     T: FloatArray, residuals: StereoResiduals, *, n_iterations: int
 ) -> FloatArray | Failure:
-    """Return the pose after the last step; after a short step the Jacobian is reused."""
-    max_gain = _SHORT**2 * residuals.columns.shape[1]
-    near: Linearization | None = None
+    """Return the pose after the last step."""
     for _ in range(n_iterations):
-        at = residuals.linearize(T, near)
+        at = residuals.linearize(T)
         if isinstance(at, Failure):
             return at
         # LAPACK called directly: numpy takes several times as long for so small a matrix.
@@ -273,10 +267,8 @@ def _gauss_newton(
             return Failure(reason=_OPEN)
         # Not the exponential map but a retraction: the same to first order, and cheap.
         T = se3.make_transform(cv2.Rodrigues(step[:3])[0], step[3:]) @ T
-        gain = step @ at.g
-        if gain < _CONVERGED:
+        if step @ at.g < _CONVERGED:
             break
-        near = at if gain < max_gain else None
     return T
 
 
@@ -342,10 +334,7 @@ def estimate_constants(
 
     Errors are in units of what is known of them: the others are around zero by a sigma of one.
 
-    The Jacobian is taken at the points as estimated from both frames. At the points as measured,
-    the source's noise would be in the Jacobian and in the residuals alike, and bias the estimate
-    of an offset of the disparities by some hundredths of a pixel. Sigma is that of the sample, not
-    implied by the matches' sigmas.
+    Sigma is that of the sample, not implied by the matches' sigmas.
 
     Parameters
     ----------
@@ -364,14 +353,11 @@ def estimate_constants(
     """
     if not residuals.constants:
         return {}
-    source_points = residuals.settled_points(T_target_source, at)
-    J_constants, J_alone = residuals.sensitivities(T_target_source, source_points)
-    target_points = T_target_source[:3, :3] @ source_points + T_target_source[:3, 3:]
-    J = pose_jacobian(target_points, residuals.camera)
-    for rows in (J_constants, J_alone, J):
+    J_constants, J_alone = residuals.sensitivities(T_target_source)
+    for rows in (J_constants, J_alone):
         whiten_in_place(at.factors, rows)
-    flat, flat_pose = J_constants.reshape(len(J_constants), -1), J.reshape(6, -1)
-    _, motion, info = dposv(flat_pose @ flat_pose.T, flat_pose @ flat.T)
+    flat, flat_pose = J_constants.reshape(len(J_constants), -1), at.J.reshape(6, -1)
+    _, motion, info = dposv(at.H, flat_pose @ flat.T)
     if info != 0:
         return {}
     # Schur complement: what no motion explains.

@@ -102,13 +102,11 @@ class Linearization:
     Parameters
     ----------
     J : ndarray of float64, shape (6, 3, n)
-        Of the predictions by the pose, or by one near it.
+        Of the predictions by the pose.
     r : ndarray of float64, shape (3, n)
         Residuals: measurement less prediction.
-    roots : ndarray of float64, shape (n,)
-        Square roots of the robust weights where J was taken.
     factors : ndarray of float64, shape (6, n)
-        Factors W of `StereoResiduals`, times these roots.
+        Factors W of `StereoResiduals`, times the square roots of the weights.
     H : ndarray of float64, shape (6, 6)
     g : ndarray of float64, shape (6,)
         The normal equations H step = g.
@@ -116,7 +114,6 @@ class Linearization:
 
     J: FloatArray
     r: FloatArray
-    roots: FloatArray
     factors: FloatArray
     H: FloatArray
     g: FloatArray
@@ -176,32 +173,6 @@ class StereoResiduals:
         """Points in the source frame, shape (3, n), metres."""
         return self.columns[:3]
 
-    def settled_points(self, T: FloatArray, at: Linearization) -> FloatArray:
-        """Return the source points as estimated from both frames, shape (3, n), metres.
-
-        The source's measurement is corrected by its share of the residual. So corrected, points
-        are not correlated with their own residuals, as measured ones are.
-
-        Parameters
-        ----------
-        T : ndarray of float64, shape (4, 4)
-            T_target_source.
-        at : Linearization
-            At that pose.
-        """
-        f, r = at.factors, at.r
-        back = np.stack([f[0] * r[0] + f[1] * r[1] + f[3] * r[2], f[2] * r[1] + f[4] * r[2]])
-        back = np.concatenate([back, [f[5] * r[2]]])  # W^T W times the residual
-        shift = np.einsum("kin,in->kn", source_jacobian(T, self.source_points, self.camera), back)
-        shift *= self.columns[12:_N_ROWS]
-        camera, (x, y, z) = self.camera, self.source_points
-        disparity = camera.fx * camera.baseline / z
-        moved = np.maximum(disparity + shift[2], 0.5 * disparity)
-        z_moved = camera.fx * camera.baseline / moved
-        x_moved = (x / z + shift[0] / camera.fx) * z_moved
-        y_moved = (y / z + shift[1] / camera.fy) * z_moved
-        return np.stack([x_moved, y_moved, z_moved])
-
     def select(self, chosen: BoolArray) -> StereoResiduals:
         """Return the residuals of some matches."""
         return replace(self, columns=self.columns.take(np.flatnonzero(chosen), axis=1))
@@ -212,17 +183,13 @@ class StereoResiduals:
         columns[3:6] -= errors
         return replace(self, columns=columns)
 
-    def sensitivities(
-        self, T: FloatArray, source_points: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def sensitivities(self, T: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the derivatives by the constants, not whitened.
 
         Parameters
         ----------
         T : ndarray of float64, shape (4, 4)
             T_target_source.
-        source_points : ndarray of float64, shape (3, n)
-            See `settled_points`.
 
         Returns
         -------
@@ -234,38 +201,28 @@ class StereoResiduals:
         in_source, in_target = np.swapaxes(
             self.columns[_N_ROWS:].reshape(len(self.constants), 2, 3, n), 0, 1
         )
-        J = source_jacobian(T, source_points, self.camera)
+        J = source_jacobian(T, self.source_points, self.camera)
         # An error moves the measurement in the target directly, the prediction through the source.
         return in_target - np.einsum("jin,kjn->kin", J, in_source), in_target.copy()
 
-    def linearize(
-        self, T: FloatArray, near: Linearization | None = None
-    ) -> Linearization | Failure:
+    def linearize(self, T: FloatArray) -> Linearization | Failure:
         """Linearize at T; a failure if points fall behind the camera.
 
         Parameters
         ----------
         T : ndarray of float64, shape (4, 4)
             T_target_source.
-        near : Linearization, optional
-            Of a pose near it, whose Jacobian is taken, in two fifths of the time: in the last steps
-            it hardly changes, residuals and weights do. With either, g is zero at the optimum.
         """
         points = self._moved(T)
         if isinstance(points, Failure):
             return points
         r, roots = self._weighed(points)
-        if near is not None:
-            r *= roots**2 / near.roots
-            return replace(near, r=r, g=near.J.reshape(6, -1) @ r.ravel())
         r *= roots
         factors = self.columns[6:12] * roots
         J = pose_jacobian(points, self.camera)
         whiten_in_place(factors, J)
         flat = J.reshape(6, -1)
-        return Linearization(
-            J=J, r=r, roots=roots, factors=factors, H=flat @ flat.T, g=flat @ r.ravel()
-        )
+        return Linearization(J=J, r=r, factors=factors, H=flat @ flat.T, g=flat @ r.ravel())
 
     def within(self, T: FloatArray, gate: float) -> BoolArray:
         """Tell which residuals are shorter than a gate in sigmas; none behind the camera."""

@@ -318,9 +318,7 @@ def test_effects_tell_how_the_pose_follows_what_is_taken_off() -> None:
     # Known to be so much, in place of what was estimated.
     for k in range(2):
         known = found.values + 0.05 * np.eye(2)[k]
-        errors = np.einsum(
-            "kin,k->in", residuals.sensitivities(T, residuals.source_points)[0], known
-        )
+        errors = np.einsum("kin,k->in", residuals.sensitivities(T)[0], known)
         moved = descend(found.T_target_source, residuals.without(errors), n_iterations=8)
         assert moved is not None
         step = se3.log(moved @ se3.invert(found.T_target_source))
