@@ -69,9 +69,7 @@ def choose_links(
 
     A link adds what has become uncertain since the last one: the errors of steps accumulate with
     their number, and what is seen of it grows with the overlap. The product has to be at least
-    `link_gain`; the largest come first. What is measured again from the same place adds nothing.
-    One that could not be registered waits three quarters of its turn: else it would be asked with
-    every frame, and in vain.
+    `link_gain`; the largest come first. One that could not be registered waits for its next turn.
 
     Parameters
     ----------
@@ -80,8 +78,7 @@ def choose_links(
     config : WindowConfig
         `n_links`, of which one goes to the predecessor, and `link_gain`.
     n_unasked : mapping of frame to int
-        Steps since each was asked last, or since it itself; 0 where the view has not changed
-        since.
+        Steps since each was asked last, or since it itself.
     exclude : hashable
         The predecessor.
 

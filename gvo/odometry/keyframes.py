@@ -23,11 +23,6 @@ from gvo.types import Edge, Estimate, FloatArray, FrameLink, LinkKind
 
 # Points of a keyframe that its view overlap is estimated from.
 _N_SAMPLES = 64
-# A view has changed where these points, of which every so manieth is looked at, moved by so much:
-# then a keyframe's patches are measured anew, with other errors.
-_CHANGED_PX = 1.0
-_SPARSE = 4
-_MIN_DEPTH_M = 0.05
 # Beyond this ratio of depths a point is not matched again by patches of one size.
 _MAX_ZOOM = 1.6
 
@@ -38,14 +33,6 @@ class _Keyframe(Generic[ObservationsT]):
 
     observations: ObservationsT
     points_cam: FloatArray | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Attempt:
-    """The last registration against a keyframe: from where, and whether it gave a link."""
-
-    T_frame_keyframe: FloatArray
-    is_linked: bool
 
 
 class Keyframes(Generic[ObservationsT]):
@@ -64,7 +51,8 @@ class Keyframes(Generic[ObservationsT]):
     def __init__(self, camera: StereoCamera | None, config: WindowConfig) -> None:
         self._camera, self._config = camera, config
         self._kept: dict[int, _Keyframe[ObservationsT]] = {}
-        self._attempts: dict[int, _Attempt] = {}
+        # Those whose last registration failed.
+        self._unlinked: set[int] = set()
         # Numbers of steps at which keyframes were asked for a link last, and in view last.
         self._asked_at: dict[int, int] = {}
         self._seen_at: dict[int, int] = {}
@@ -82,39 +70,21 @@ class Keyframes(Generic[ObservationsT]):
         """Return the number of kept frames."""
         return len(self._kept)
 
-    def n_unasked(
-        self, T_frame_keyframes: Mapping[int, FloatArray], n_steps: int
-    ) -> dict[int, int]:
-        """Return the steps since keyframes were asked, or kept; 0 where the view is the same.
+    def n_unasked(self, n_steps: int) -> dict[int, int]:
+        """Return the number of steps since each keyframe was asked for a link, or kept."""
+        return {stamp_ns: n_steps - asked_at for stamp_ns, asked_at in self._asked_at.items()}
 
-        Parameters
-        ----------
-        T_frame_keyframes : mapping of int to ndarray of float64, shape (4, 4)
-            By stamp of the keyframe.
-        n_steps : int
-            Of the current frame, since the first one.
-        """
-        return {
-            ns: n_steps - self._asked_at[ns] if self._is_changed(ns, T) else 0
-            for ns, T in T_frame_keyframes.items()
-        }
-
-    def note_attempt(
-        self, stamp_ns: int, T_frame_keyframe: FloatArray, n_steps: int, *, is_linked: bool
-    ) -> None:
-        """Remember from where a keyframe was registered, or could not be."""
-        self._attempts[stamp_ns] = _Attempt(T_frame_keyframe=T_frame_keyframe, is_linked=is_linked)
-        # A quarter of the steps before an attempt in vain counts again.
-        before = n_steps if is_linked else self._asked_at[stamp_ns]
-        self._asked_at[stamp_ns] = (before + 3 * n_steps) // 4
+    def note_attempt(self, stamp_ns: int, n_steps: int, *, is_linked: bool) -> None:
+        """Remember that a keyframe was asked for a link, and whether it gave one."""
+        self._asked_at[stamp_ns] = n_steps
+        if is_linked:
+            self._unlinked.discard(stamp_ns)
+        else:
+            self._unlinked.add(stamp_ns)
 
     def registrable(self, scores: Mapping[int, float]) -> dict[int, float]:
         """Return the scores without keyframes whose last registration failed."""
-        return {
-            stamp_ns: score
-            for stamp_ns, score in scores.items()
-            if stamp_ns not in self._attempts or self._attempts[stamp_ns].is_linked
-        }
+        return {ns: score for ns, score in scores.items() if ns not in self._unlinked}
 
     def note_seen(self, scores: Mapping[int, float], n_steps: int) -> None:
         """Remember which keyframes are in view of the current frame."""
@@ -125,21 +95,6 @@ class Keyframes(Generic[ObservationsT]):
     def n_unseen(self, n_steps: int) -> dict[int, int]:
         """Return the number of steps since each keyframe was in view."""
         return {stamp_ns: n_steps - seen_at for stamp_ns, seen_at in self._seen_at.items()}
-
-    def _is_changed(self, stamp_ns: int, T_frame_keyframe: FloatArray) -> bool:
-        """Tell whether a keyframe's points moved in the image since it was registered last."""
-        attempt, camera = self._attempts.get(stamp_ns), self._camera
-        points = self._kept[stamp_ns].points_cam
-        if attempt is None or points is None or camera is None or len(points) == 0:
-            return True
-        pixels = []
-        for T in (attempt.T_frame_keyframe, T_frame_keyframe):
-            moved = se3.transform_points(T, points[::_SPARSE])
-            moved[:, 2] = np.maximum(moved[:, 2], _MIN_DEPTH_M)
-            pixels.append(camera.project(moved))
-        moves = np.sort(np.abs(pixels[0] - pixels[1]).max(axis=1))
-        # The median; `np.median` takes as long as all of the above.
-        return bool(moves[(len(moves) - 1) // 2] + moves[len(moves) // 2] >= 2.0 * _CHANGED_PX)
 
     def reconfigure(self, camera: StereoCamera | None, config: WindowConfig) -> None:
         """Score with another camera or configuration from now on; what is kept stays."""
@@ -161,7 +116,7 @@ class Keyframes(Generic[ObservationsT]):
         """Forget a kept frame."""
         del self._kept[stamp_ns]
         del self._asked_at[stamp_ns], self._seen_at[stamp_ns]
-        self._attempts.pop(stamp_ns, None)
+        self._unlinked.discard(stamp_ns)
 
     def scores(self, T_current_keyframe: Mapping[int, FloatArray]) -> dict[int, float]:
         """Return how much the current frame has in common with keyframes, 0 to 1.

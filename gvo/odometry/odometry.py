@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from gvo.backend.keyframe_policy import MIN_OVERLAP, choose_unseen, is_needed
+from gvo.backend.keyframe_policy import choose_unseen, is_needed
 from gvo.backend.window import SlidingWindow
 from gvo.config import Config
 from gvo.frontend.calibration import RigOffsets
@@ -367,8 +367,7 @@ class Odometry:
     ) -> list[Edge]:
         self._keyframes.note_seen(scores, step.n_steps)
         measure = partial(self._register_keyframe, observations, step)
-        in_view = {ns: T for ns, T in T_frame_keyframes.items() if scores[ns] >= MIN_OVERLAP}
-        n_unasked = self._keyframes.n_unasked(in_view, step.n_steps)
+        n_unasked = self._keyframes.n_unasked(step.n_steps)
         config = self._config.window
         return link_keyframes(measure, scores, T_frame_keyframes, step, config, n_unasked=n_unasked)
 
@@ -393,8 +392,7 @@ class Odometry:
         prior = MotionPrior(T_predicted=T_keyframe_frame, is_confirmed=step.is_registered)
         result = self._frontend.register(self._keyframes[stamp_ns], observations, prior)
         is_linked = isinstance(result, RelativePose)
-        T_frame_keyframe = se3.invert(T_keyframe_frame)
-        self._keyframes.note_attempt(stamp_ns, T_frame_keyframe, step.n_steps, is_linked=is_linked)
+        self._keyframes.note_attempt(stamp_ns, step.n_steps, is_linked=is_linked)
         if isinstance(result, Failure):
             return None
         T, covariance = result.T_reference_current, result.covariance

@@ -103,12 +103,6 @@ def test_links_go_where_many_unlinked_steps_or_many_points_lie_between() -> None
         assert choose_links(scores, configure(), n_unasked=unlinked) == expected
 
 
-def test_what_is_seen_from_the_same_place_again_is_spare() -> None:
-    scores = {10: 0.99, 20: 0.5}
-    chosen = choose_links(scores, configure(), n_unasked={10: 0, 20: 4})
-    assert chosen == ([20], [10])
-
-
 def test_those_seen_least_recently_are_released_and_of_these_the_least_in_view() -> None:
     scores = {1: 0.9, 2: 0.0, 3: 0.1, 4: 0.2}
     unseen = {1: 0, 2: 7, 3: 12, 4: 7}
