@@ -148,7 +148,7 @@ class StereoFrame:
         _check_images("a stereo frame", self.stamp_ns, self.left, self.right, np.uint8)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RgbdFrame:
     """One undistorted grey image with its depth.
 
@@ -196,7 +196,7 @@ class FaultyFrame:
 Frame: TypeAlias = StereoFrame | RgbdFrame
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Observations:
     """What a front-end keeps of one frame: n points, seen and measured in 3-D.
 
@@ -290,7 +290,7 @@ class ConstantError:
         return replace(self, sigma=factor * self.sigma)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RelativePose:
     """A registration's result.
 

@@ -125,7 +125,7 @@ def report(result: RunResult, out: Path) -> NoReturn:
 
 def tell(result: RunResult, out: Path) -> None:
     """Print the result of a run."""
-    from gvo.frontend.calibration import describe_offsets
+    from gvo.frontend.rig import describe_offsets
     from gvo.io.run_folder.verdict import loop_words, verdict
     from gvo.trajectory.evaluation import format_evaluations
 

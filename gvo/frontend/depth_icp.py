@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -223,46 +223,41 @@ def _invert(H: FloatArray, reference: DepthMap) -> tuple[FloatArray, FloatArray]
     return (vectors * gains) @ vectors.T, (vectors * losses) @ vectors.T
 
 
-class DepthAligner:
-    """Aligns the depth images of frames; what is prepared of one is kept as long as its frame.
+class DepthImage:
+    """The depth image of a frame, and what is prepared of it when it is needed.
 
     Parameters
     ----------
+    frame : RgbdFrame
     camera : StereoCamera
         That the depth is registered to.
     config : DepthConfig
     """
 
-    def __init__(self, camera: StereoCamera, config: DepthConfig) -> None:
-        self._camera = camera
-        self._config = config
-        self._maps: WeakKeyDictionary[RgbdFrame, DepthMap] = WeakKeyDictionary()
-        self._grids: WeakKeyDictionary[RgbdFrame, FloatArray] = WeakKeyDictionary()
+    def __init__(self, frame: RgbdFrame, camera: StereoCamera, config: DepthConfig) -> None:
+        self._frame, self._camera, self._config = frame, camera, config
 
-    def grid(self, frame: RgbdFrame) -> FloatArray:
-        """Return a grid of points of a depth image, see `grid_points`."""
-        if frame not in self._grids:
-            self._grids[frame] = grid_points(frame.depth, self._camera, self._config)
-        return self._grids[frame]
+    @cached_property
+    def grid(self) -> FloatArray:
+        """A grid of its points, see `grid_points`."""
+        return grid_points(self._frame.depth, self._camera, self._config)
 
-    def align(
-        self, reference: RgbdFrame, current: RgbdFrame, T_reference_current: FloatArray
-    ) -> RelativePose | Failure:
-        """Estimate the motion by depth alone; as `align_depth_maps`.
+    @cached_property
+    def reduced(self) -> DepthMap:
+        """The reduced image that is aligned."""
+        return DepthMap.of(self._frame.depth, self._camera, self._config)
+
+    def align(self, current: DepthImage, T_reference_current: FloatArray) -> RelativePose | Failure:
+        """Estimate the motion to a current frame by depth alone; as `align_depth_maps`.
 
         Fails where a depth image was not taken together with its colour image, or was repeated.
         """
-        if not (_is_simultaneous(reference) and _is_simultaneous(current)):
+        if not (_is_simultaneous(self._frame) and _is_simultaneous(current._frame)):
             return Failure(reason="colour and depth were not taken together")
-        first, second = self._map(reference), self._map(current)
+        first, second = self.reduced, current.reduced
         if np.array_equal(first.inverse_depths, second.inverse_depths, equal_nan=True):
             return Failure(reason="the depth image is repeated")
         return align_depth_maps(first, second, T_reference_current)
-
-    def _map(self, frame: RgbdFrame) -> DepthMap:
-        if frame not in self._maps:
-            self._maps[frame] = DepthMap.of(frame.depth, self._camera, self._config)
-        return self._maps[frame]
 
 
 def _is_simultaneous(frame: RgbdFrame) -> bool:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from gvo.config import Config
-from gvo.frontend.calibration import CalibratedCamera, Measurements, RigOffsets
 from gvo.frontend.features import FeatureExtractor, Features, thin
 from gvo.frontend.matching import match_temporal, predict_pixels
 from gvo.frontend.registration import check_view, match_anywhere, register_anywhere
 from gvo.frontend.rgbd import sample_depth
+from gvo.frontend.rig import CalibratedCamera, FrameMotion, Measurements, RigOffsets, note_step
 from gvo.frontend.stereo.matching import is_in_depth_range, match_stereo, refine_disparities
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.geometry.correspondences import Correspondences
@@ -36,6 +36,13 @@ _DISPARITY_SIGMA_PX = 0.3
 _SIGMA_FACTOR = 1.2
 # An RGB-D camera is treated as a stereo camera of this baseline, that of a Kinect.
 _VIRTUAL_BASELINE_M = 0.075
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DescriptorObservations(Observations):
+    """Observations that know how their frame moved while it was exposed."""
+
+    motion: FrameMotion = field(default_factory=FrameMotion, compare=False)
 
 
 class DescriptorFrontend:
@@ -65,7 +72,7 @@ class DescriptorFrontend:
         self._extractors = [FeatureExtractor(config.features) for _ in range(2)]
         self._pool = ThreadPoolExecutor(1) if config.runtime.threads > 1 else None
 
-    def extract(self, frame: Frame) -> Observations:
+    def extract(self, frame: Frame) -> DescriptorObservations:
         """Return the keypoints of a frame that are measured in 3-D.
 
         Parameters
@@ -77,7 +84,7 @@ class DescriptorFrontend:
             return self._extract_stereo(frame)
         return self._extract_rgbd(frame)
 
-    def _extract_stereo(self, frame: StereoFrame) -> Observations:
+    def _extract_stereo(self, frame: StereoFrame) -> DescriptorObservations:
         left, right = self._extract_both(frame)
         config = self._config.stereo
         pairs = match_stereo(left, right, self.camera, config)
@@ -94,7 +101,7 @@ class DescriptorFrontend:
         pending = self._pool.submit(second.extract, frame.right)
         return first.extract(frame.left), pending.result()
 
-    def _extract_rgbd(self, frame: RgbdFrame) -> Observations:
+    def _extract_rgbd(self, frame: RgbdFrame) -> DescriptorObservations:
         features = self._extractors[0].extract(frame.image)
         depths, is_valid = sample_depth(frame.depth, features.keypoints, self._config.depth)
         chosen = np.flatnonzero(is_valid)
@@ -109,9 +116,9 @@ class DescriptorFrontend:
         right: Features | None,
         pairs: IntArray,
         disparities: FloatArray,
-    ) -> Observations:
+    ) -> DescriptorObservations:
         keypoints = left.keypoints[pairs[:, 0]]
-        return Observations(
+        return DescriptorObservations(
             stamp_ns=stamp_ns,
             keypoints=keypoints,
             disparities=disparities,
@@ -131,13 +138,16 @@ class DescriptorFrontend:
         return np.column_stack([pixel, pixel, np.full(len(octaves), disparity)])
 
     def register(
-        self, reference: Observations, current: Observations, prior: MotionPrior | None = None
+        self,
+        reference: DescriptorObservations,
+        current: DescriptorObservations,
+        prior: MotionPrior | None = None,
     ) -> RelativePose | Failure:
         """Estimate the motion from the reference to the current frame.
 
         Parameters
         ----------
-        reference, current : Observations
+        reference, current : DescriptorObservations
         prior : MotionPrior, optional
             Matches are searched around the pixels it predicts, then in wider windows. Without
             it, in the wider windows around the previous pixels.
@@ -152,7 +162,10 @@ class DescriptorFrontend:
         return result
 
     def _register(
-        self, reference: Observations, current: Observations, prior: MotionPrior | None
+        self,
+        reference: DescriptorObservations,
+        current: DescriptorObservations,
+        prior: MotionPrior | None,
     ) -> RelativePose | Failure:
         if prior is not None:
             result = self._register_within(reference, current, prior, is_wide=False)
@@ -166,10 +179,10 @@ class DescriptorFrontend:
         # Nothing predicted it: what else it predicts must be there too.
         return self._check_view(reference, current, rough)
 
-    def describe(self, observations: Observations) -> Observations:
+    def describe(self, observations: DescriptorObservations) -> DescriptorObservations:
         """Return a frame as a place: fewer points, without what only neighbours need."""
         chosen = thin(len(observations))
-        place = replace(
+        return replace(
             observations,
             keypoints=observations.keypoints[chosen],
             disparities=observations.disparities[chosen],
@@ -178,11 +191,12 @@ class DescriptorFrontend:
             descriptors_left=observations.descriptors_left[chosen],
             descriptors_right=None,
         )
-        self.rig_offsets.velocities.copy(observations, place)
-        return place
 
     def recognize(
-        self, reference: Observations, current: Observations, observations: Observations
+        self,
+        reference: DescriptorObservations,
+        current: DescriptorObservations,
+        observations: DescriptorObservations,
     ) -> RelativePose | Failure:
         """Estimate the motion from a place to a frame, given with its own place."""
         first, second = reference.descriptors_left, observations.descriptors_left
@@ -196,7 +210,10 @@ class DescriptorFrontend:
         return self._check_view(reference, observations, rough)
 
     def _check_view(
-        self, reference: Observations, current: Observations, rough: RelativePose
+        self,
+        reference: DescriptorObservations,
+        current: DescriptorObservations,
+        rough: RelativePose,
     ) -> RelativePose | Failure:
         """Match again around the pixels that a motion predicts, and check the view."""
         prior = MotionPrior(T_predicted=rough.T_reference_current)
@@ -208,8 +225,8 @@ class DescriptorFrontend:
 
     def _register_within(
         self,
-        reference: Observations,
-        current: Observations,
+        reference: DescriptorObservations,
+        current: DescriptorObservations,
         prior: MotionPrior | None,
         *,
         is_wide: bool,
@@ -223,8 +240,8 @@ class DescriptorFrontend:
 
     def measure(
         self,
-        reference: Observations,
-        current: Observations,
+        reference: DescriptorObservations,
+        current: DescriptorObservations,
         prior: MotionPrior | None,
         *,
         is_wide: bool,
@@ -232,7 +249,7 @@ class DescriptorFrontend:
         """Match two frames in a window around the pixels that a prior predicts."""
         T_predicted = None if prior is None else prior.T_predicted
         if is_step(prior):
-            self.rig_offsets.velocities.expect(reference, current, T_predicted)
+            note_step(reference, current, T_predicted)
         predicted = predict_pixels(reference, T_predicted, self.camera)
         config = self._config.temporal
         radius_px = config.wide_radius_px if is_wide else config.radius_px

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Literal, Protocol, TypeAlias, cast
 
@@ -10,12 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo.config import Config
-from gvo.frontend.calibration import KLT_SIGMA_FACTOR, CalibratedCamera, Measurements, RigOffsets
-from gvo.frontend.depth_icp import DepthAligner
+from gvo.frontend.depth_icp import DepthImage
 from gvo.frontend.descriptor import as_stereo
 from gvo.frontend.features import describe_pixels, thin
 from gvo.frontend.registration import check_view, match_anywhere, register_anywhere
 from gvo.frontend.rgbd import check_depths, is_seen_again, sample_depth
+from gvo.frontend.rig import (
+    KLT_SIGMA_FACTOR,
+    CalibratedCamera,
+    FrameMotion,
+    Measurements,
+    RigOffsets,
+    note_step,
+)
 from gvo.frontend.stereo.corners import measure_corners
 from gvo.frontend.stereo.disparity import follow_disparities, measure_disparities
 from gvo.frontend.stereo.matching import is_in_depth_range
@@ -95,7 +102,6 @@ class KltFrontend:
         self.rig_offsets = rig_offsets or RigOffsets(config, is_stereo=self._is_stereo)
         self.calibrated = CalibratedCamera(self.camera, self.rig_offsets)
         self._config = config
-        self._depths = DepthAligner(self.camera, config.depth)
 
     def extract(self, frame: Frame) -> KltObservations:
         """Return a frame with its corners that are measured in 3-D.
@@ -107,7 +113,12 @@ class KltFrontend:
         self.rig_offsets.advance()
         half = halve(image_of(frame))
         corners = self._find_corners(frame, half, self._config.klt.n_corners)
-        return KltObservations(frame=frame, half=half, corners=corners)
+        depth = (
+            DepthImage(frame, self.camera, self._config.depth)
+            if isinstance(frame, RgbdFrame)
+            else None
+        )
+        return KltObservations(frame=frame, half=half, corners=corners, depth=depth)
 
     def _find_corners(
         self, frame: Frame, half: ImageArray, n_corners: int, *, spacing_px: int = SPACING_PX
@@ -198,16 +209,15 @@ class KltFrontend:
         found = MotionPrior(T_predicted=rough.T_reference_current)
         result = self._register_step(found, reference, current, "near")
         # Nothing predicted it: what else it predicts must be there too.
-        return self._check_view(result, reference, self._grid(reference), current.frame)
+        return self._check_view(result, reference, reference.depth_points, current.frame)
 
     def align_depth(
         self, reference: KltObservations, current: KltObservations, T_reference_current: FloatArray
     ) -> RelativePose | Failure:
         """Estimate the motion from a start value by ICP of the depth images of an RGB-D camera."""
-        first, second = reference.frame, current.frame
-        if isinstance(first, RgbdFrame) and isinstance(second, RgbdFrame):
-            return self._depths.align(first, second, T_reference_current)
-        return Failure(reason="a stereo camera has no depth images")
+        if reference.depth is None or current.depth is None:
+            return Failure(reason="a stereo camera has no depth images")
+        return reference.depth.align(current.depth, T_reference_current)
 
     def describe(self, observations: KltObservations) -> KltPlace:
         """Return a frame as a place: small, but for its image all that `recognize` needs."""
@@ -222,13 +232,9 @@ class KltFrontend:
         return self._describe(observations, corners)
 
     def _describe(self, observations: KltObservations, corners: KltCorners) -> KltPlace:
-        frame = observations.frame
         image, chosen = observations.image, thin(len(corners.keypoints))
-        keypoints = corners.keypoints[chosen]
-        depth_points = None
-        if isinstance(frame, RgbdFrame):
-            depth_points = self._depths.grid(frame).astype(np.float32)
-        place = KltPlace(
+        keypoints, grid = corners.keypoints[chosen], observations.depth_points
+        return KltPlace(
             stamp_ns=observations.stamp_ns,
             pixels=np.column_stack([keypoints, corners.disparities[chosen]]).astype(np.float32),
             points=corners.points_cam[chosen].astype(np.float32),
@@ -236,10 +242,9 @@ class KltFrontend:
             patches=cut_patches(image, keypoints, RADIUS_PX + 1),
             descriptors_left=describe_pixels(image, keypoints),
             descriptors_wide=describe_pixels(image, keypoints, _WIDE),
-            depth_points=depth_points,
+            depth_points=None if grid is None else grid.astype(np.float32),
+            motion=observations.motion,
         )
-        self.rig_offsets.velocities.copy(observations, place)
-        return place
 
     def recognize(
         self, reference: KltPlace, current: KltPlace, observations: KltObservations
@@ -284,10 +289,6 @@ class KltFrontend:
             return check_view(result, reference.points_cam, self.camera, depths_agree=True)
         return checked
 
-    def _grid(self, observations: KltObservations) -> FloatArray | None:
-        frame = observations.frame
-        return self._depths.grid(frame) if isinstance(frame, RgbdFrame) else None
-
     def _register_places(self, reference: KltPlace, current: KltPlace) -> RelativePose | Failure:
         """Register by descriptors, which match corners that moved too far for a track."""
         first, second = (self._as_observations(place) for place in (reference, current))
@@ -312,7 +313,7 @@ class KltFrontend:
         self, reference: KltObservations, current: KltObservations, result: RelativePose
     ) -> RelativePose | Failure:
         """Refuse a motion that the depth images of an RGB-D camera contradict."""
-        points, frame = self._grid(reference), current.frame
+        points, frame = reference.depth_points, current.frame
         if points is None or not isinstance(frame, RgbdFrame):
             return result
         return check_depths(result, points, frame.depth, self.camera, self._config.depth)
@@ -343,7 +344,7 @@ class KltFrontend:
     ) -> Measurements:
         """Track the corners of a step from the pixels that its prior predicts; measure them."""
         T_predicted = None if prior is None else prior.T_predicted
-        self.rig_offsets.velocities.expect(reference, current, T_predicted)
+        note_step(reference, current, T_predicted)
         T = np.eye(4) if T_predicted is None else T_predicted
         expected = self.predict(T, reference, current)
         return self._track(reference, current, expected, "wide" if is_wide else "near")
@@ -551,6 +552,9 @@ class _Reference(Protocol):
     def stamp_ns(self) -> int: ...
 
     @property
+    def motion(self) -> FrameMotion: ...
+
+    @property
     def keypoints(self) -> FloatArray: ...
 
     @property
@@ -566,7 +570,7 @@ class _Reference(Protocol):
     def templates(self) -> Templates: ...
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class KltObservations:
     """A frame to track corners into, and its own corners.
 
@@ -577,11 +581,17 @@ class KltObservations:
         The image to track in, of half the size.
     corners : KltCorners
         Its own, tracked when the next frame comes.
+    depth : DepthImage or None
+        None for stereo.
+    motion : FrameMotion
+        Filled in by the steps before and after the frame.
     """
 
     frame: Frame
     half: ImageArray
     corners: KltCorners
+    depth: DepthImage | None = field(default=None, compare=False)
+    motion: FrameMotion = field(default_factory=FrameMotion, compare=False)
 
     @property
     def stamp_ns(self) -> int:
@@ -619,6 +629,11 @@ class KltObservations:
         return self.corners.templates
 
     @property
+    def depth_points(self) -> FloatArray | None:
+        """A grid of the depth image as points in the `cam` frame, metres; None for stereo."""
+        return None if self.depth is None else self.depth.grid
+
+    @property
     def n_keypoints(self) -> int:
         """Corners detected, measured or not."""
         return self.corners.n_keypoints
@@ -628,7 +643,7 @@ class KltObservations:
         return len(self.keypoints)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class KltPlace:
     """A frame kept small: its corners with their descriptors and patches.
 
@@ -647,6 +662,8 @@ class KltPlace:
         Of patches of two sizes.
     depth_points : ndarray of float32, shape (m, 3), or None
         A grid of the depth image as points, metres.
+    motion : FrameMotion
+        That of the frame.
     """
 
     stamp_ns: int
@@ -656,7 +673,8 @@ class KltPlace:
     patches: NDArray[np.uint8]
     descriptors_left: NDArray[np.uint8]
     descriptors_wide: NDArray[np.uint8]
-    depth_points: NDArray[np.float32] | None = None
+    depth_points: NDArray[np.float32] | None
+    motion: FrameMotion = field(compare=False)
 
     @property
     def descriptors(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

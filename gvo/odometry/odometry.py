@@ -14,11 +14,11 @@ import numpy as np
 from gvo.backend.keyframe_policy import choose_unseen, is_needed
 from gvo.backend.window import SlidingWindow
 from gvo.config import Config
-from gvo.frontend.calibration import RigOffsets
 from gvo.frontend.depth_icp import DepthTrust
 from gvo.frontend.descriptor import as_stereo
 from gvo.frontend.factory import find_change, frame_of, make_frontend
 from gvo.frontend.protocol import CheckedFrontend, Frontend, count_points
+from gvo.frontend.rig import RigOffsets
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.odometry.chain import RawChain, RawStep

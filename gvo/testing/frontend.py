@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from gvo.frontend.calibration import RigOffsets
 from gvo.frontend.protocol import CheckedFrontend, Frontend, Recognizer, find_fault
+from gvo.frontend.rig import RigOffsets
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.types import (
@@ -94,12 +94,12 @@ def check_frontend(
         result = _find(frontend, each, each)
         name = f"register of the frame at {each.stamp_ns} with itself and the identity"
         _check_agreement(name, result.T_reference_current, result.covariance)
+    if isinstance(frames[0], StereoFrame | RgbdFrame):
+        _check_direction(frontend, frames[0], frames[1].stamp_ns + 1)
     results = [_find(frontend, *pair) for pair in pairwise(seen)]
     for pair, result in zip(pairwise(seen), results, strict=True):
         _check_inverse(frontend, result, *pair)
         _check_prior(frontend, result, *pair)
-    if isinstance(frames[0], StereoFrame | RgbdFrame):
-        _check_direction(frontend, frames[0], frames[1].stamp_ns + 1)
     for nothing in _without_anything(frames[0], frames[-1].stamp_ns, blank):
         _check_places(CheckedFrontend(frontend).recognizer, seen[0], nothing)
         _check_nothing_seen(frontend, seen[0], nothing)
@@ -294,7 +294,10 @@ def _check_nothing_seen(frontend: Frontend[Any], seen: Stamped, frame: Stamped) 
 
 
 def fingerprint(value: object) -> str:
-    """Return a digest of all arrays and plain values that a value holds, six levels deep."""
+    """Return a digest of all arrays and plain values that a value holds, six levels deep.
+
+    Fields of data classes with `compare=False` are no part of the value.
+    """
     return hashlib.blake2b(b"|".join(_parts(value, _MAX_DEPTH))).hexdigest()
 
 
@@ -313,7 +316,8 @@ def _parts(value: object, depth: int) -> Iterator[bytes]:
 
 def _members(value: object) -> Iterator[tuple[str, object]]:
     if is_dataclass(value):
-        yield from ((field.name, getattr(value, field.name)) for field in fields(value))
+        own = (field.name for field in fields(value) if field.compare)
+        yield from ((name, getattr(value, name)) for name in own)
     elif isinstance(value, Mapping):
         yield from ((repr(key), member) for key, member in value.items())
     elif isinstance(value, list | tuple):

@@ -9,7 +9,7 @@ import pytest
 
 import gvo
 from gvo.config import DepthConfig
-from gvo.frontend.depth_icp import DepthAligner, DepthMap, DepthTrust, align_depth_maps
+from gvo.frontend.depth_icp import DepthImage, DepthMap, DepthTrust, align_depth_maps
 from gvo.frontend.descriptor import as_stereo
 from gvo.geometry import se3
 from gvo.io.recording import StampedImage
@@ -83,15 +83,15 @@ def test_a_wall_tells_three_directions_and_leaves_the_others_as_they_were() -> N
 
 def test_images_of_other_places_and_repeated_or_late_ones_fail() -> None:
     camera, frames, _ = recording()
-    aligner = DepthAligner(camera, DepthConfig())
+    first, second = (DepthImage(frame, camera, DepthConfig()) for frame in frames[:2])
     late = replace(frames[1], depth_stamp_ns=frames[1].stamp_ns + 10_000_000)
     repeated = replace(frames[1], depth=frames[0].depth)
     far = replace(frames[1], depth=frames[1].depth + np.float32(2.0))
     for frame, reason in ((late, "together"), (repeated, "repeated"), (far, "fit each other")):
-        result = aligner.align(frames[0], frame, np.eye(4))
+        result = first.align(DepthImage(frame, camera, DepthConfig()), np.eye(4))
         assert isinstance(result, Failure)
         assert reason in result.reason
-    assert aligner.align(frames[0], frames[1], np.eye(4))
+    assert first.align(second, np.eye(4))
 
 
 def test_a_frame_knows_when_its_depth_was_taken() -> None:

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gvo.config import Config
-from gvo.frontend.calibration import RigOffsets
 from gvo.frontend.descriptor import DescriptorFrontend, as_stereo
+from gvo.frontend.rig import RigOffsets
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.types import (
     Failure,

@@ -9,11 +9,11 @@ import pytest
 
 import gvo
 from gvo.config import Config
-from gvo.frontend.calibration import DISPARITY, ConstantFilter
 from gvo.frontend.descriptor import DescriptorFrontend
 from gvo.frontend.factory import make_frontend
 from gvo.frontend.klt import KltFrontend, KltObservations
 from gvo.frontend.registration import check_view
+from gvo.frontend.rig import DISPARITY, ConstantFilter
 from gvo.geometry import se3
 from gvo.io.recording import Sensor
 from gvo.types import Failure, FloatArray, Frame, MotionPrior, RelativePose, RgbdFrame, StereoFrame
@@ -67,7 +67,7 @@ def test_the_points_lie_on_the_surfaces(sensor: Sensor) -> None:
 
 
 def expect(T: FloatArray | None) -> MotionPrior | None:
-    return None if T is None else MotionPrior(T_predicted=T, T_recent=T)
+    return None if T is None else MotionPrior(T_predicted=T)
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
@@ -76,7 +76,9 @@ def test_the_motion_is_found_with_and_without_a_prediction(sensor: Sensor, prior
     T = true_motion(sensor, 0, 2)
     priors = {"none": None, "true": T, "wrong": wrong(T, 0.005), "far off": wrong(T, 0.02)}
     first, _, third = observations(sensor)[:3]
-    result = frontend(sensor).register(first, third, expect(priors[prior]))
+    T_predicted = priors[prior]
+    expected = None if T_predicted is None else MotionPrior(T_predicted=T_predicted, T_recent=T)
+    result = frontend(sensor).register(first, third, expected)
     assert isinstance(result, RelativePose)
     error = se3.log(se3.invert(result.T_reference_current) @ T)
     assert np.linalg.norm(error[:3]) < 1.5e-3

@@ -167,25 +167,6 @@ def test_a_direction_is_open_beyond_100000_sigmas(inflation: float, is_open: boo
 # The rounds of a refinement.
 
 
-def test_the_first_round_has_two_steps_and_the_second_ten() -> None:
-    rng = np.random.default_rng(0)
-    T, matches = measure(rng, rng.normal(size=(40, 3)))
-    # So far away, and so narrow a kernel, that no step is small.
-    start = se3.exp(np.full(6, 0.05)) @ T
-    found = refine_pose(start, matches, all_of(matches), CAMERA, huber=0.01, gate=1e6)
-    assert isinstance(found, Refinement)
-    residuals = StereoResiduals.of(start, matches, CAMERA, huber=0.01)
-    ends = []
-    for n_first, n_second in ((2, 10), (2, 9), (1, 10)):
-        rough = descend(start, residuals, n_iterations=n_first)
-        assert rough is not None
-        end = descend(rough, residuals, n_iterations=n_second)
-        assert end is not None
-        ends.append(se3.normalize(end))
-    are_equal = [np.array_equal(found.T_target_source, end) for end in ends]
-    assert are_equal == [True, False, False]
-
-
 def test_steps_end_where_they_are_a_thirtieth_of_a_sigma() -> None:
     rng = np.random.default_rng(1)
     T, matches = measure(rng, 1e-3 * rng.normal(size=(40, 3)))

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from gvo.config import CameraConfig, Config, FrontendConfig
-from gvo.frontend.calibration import RigOffsets
 from gvo.frontend.klt import KltFrontend
+from gvo.frontend.rig import RigOffsets
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.odometry.odometry import Odometry

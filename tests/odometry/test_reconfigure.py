@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from gvo.config import Config
 from gvo.errors import SmoothingError
-from gvo.frontend.calibration import OFFSET_SIGMA_PX
 from gvo.frontend.descriptor import DescriptorFrontend
 from gvo.frontend.klt import KltFrontend
+from gvo.frontend.rig import OFFSET_SIGMA_PX
 from gvo.io.frames import frames
 from gvo.io.recording import Sensor
 from gvo.io.synthetic import SyntheticRecording

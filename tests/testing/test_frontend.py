@@ -10,13 +10,13 @@ import pytest
 
 import gvo
 from gvo.config import Config
-from gvo.frontend.descriptor import DescriptorFrontend
+from gvo.frontend.descriptor import DescriptorFrontend, DescriptorObservations
 from gvo.frontend.factory import make_frontend
 from gvo.frontend.klt import KltFrontend, KltObservations
 from gvo.geometry import se3
 from gvo.io.recording import Sensor
 from gvo.testing import ContractError, check_frontend
-from gvo.types import Failure, FloatArray, Frame, MotionPrior, Observations, RelativePose
+from gvo.types import Failure, FloatArray, Frame, MotionPrior, RelativePose
 from tests.make.recordings import frames_of
 
 Result = RelativePose | Failure
@@ -148,17 +148,20 @@ class ExtractsAtRandom(DescriptorFrontend):
     def __init__(self) -> None:
         super().__init__(recording("stereo").info.camera, configure("descriptor"))
 
-    def extract(self, frame: Frame) -> Observations:
+    def extract(self, frame: Frame) -> DescriptorObservations:
         observations = super().extract(frame)
         return replace(observations, n_keypoints=int(np.random.default_rng().integers(2**62)))
 
 
 class ChangesObservations(ExtractsAtRandom):
-    def extract(self, frame: Frame) -> Observations:
+    def extract(self, frame: Frame) -> DescriptorObservations:
         return DescriptorFrontend.extract(self, frame)
 
     def register(
-        self, reference: Observations, current: Observations, prior: MotionPrior | None = None
+        self,
+        reference: DescriptorObservations,
+        current: DescriptorObservations,
+        prior: MotionPrior | None = None,
     ) -> Result:
         result = super().register(reference, current, prior)
         current.points_cam[:1] += 1.0

@@ -10,11 +10,11 @@ import numpy as np
 from gvo.config import Config
 from gvo.diagnostics.explain.extraction import as_mask, distance_tests
 from gvo.diagnostics.explain.values import Registration, Sorting
-from gvo.frontend.calibration import Measurements
 from gvo.frontend.descriptor import DescriptorFrontend, is_step
 from gvo.frontend.klt import KltFrontend
 from gvo.frontend.matching import compare_within, predict_pixels
 from gvo.frontend.registration import find_consensus
+from gvo.frontend.rig import Measurements
 from gvo.frontend.tracking import WINDOW_RADIUS_PX
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera

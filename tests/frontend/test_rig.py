@@ -1,8 +1,7 @@
 """Constant errors of a camera: the filter, a rolling shutter, and rendered planted errors."""
 
-import gc
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import pairwise
 from typing import Any, Literal
@@ -17,17 +16,18 @@ from scipy.optimize import brentq
 import gvo
 from gvo.config import Config
 from gvo.frontend import klt
-from gvo.frontend.calibration import (
+from gvo.frontend.factory import make_frontend
+from gvo.frontend.rig import (
     ConstantFilter,
-    FrameVelocities,
+    FrameMotion,
     MeasuredVelocity,
     RigOffsets,
     VarianceFactor,
     describe_offsets,
+    note_step,
     settle_rows,
     settling_rates,
 )
-from gvo.frontend.factory import make_frontend
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.refinement import Adjustment
@@ -291,72 +291,69 @@ def test_what_is_learnt_is_told_in_words() -> None:
 @dataclass(frozen=True, eq=False)
 class Seen:
     stamp_ns: int
+    motion: FrameMotion = field(default_factory=FrameMotion)
 
 
 STEPS = np.array([[0.01, -0.02, 0.005, 0.03, 0.01, 0.04], [0, 0.02, 0, 0.01, 0, 0.06]])
 
 
-def assert_velocity(velocities: FrameVelocities, frame: Seen, expected: FloatArray) -> None:
-    velocity = velocities.of(frame)
+def assert_velocity(frame: Seen, expected: FloatArray) -> None:
+    velocity = frame.motion.velocity
     assert velocity is not None
     np.testing.assert_allclose(velocity, expected, atol=1e-12)
 
 
 def test_a_frame_moves_with_the_mean_of_the_steps_around_it() -> None:
     first, second, third = (Seen(stamp) for stamp in (0, 100_000_000, 150_000_000))
-    velocities = FrameVelocities()
-    assert velocities.of(second) is None
-    velocities.expect(first, second, se3.exp(STEPS[0]))
-    assert_velocity(velocities, first, 10.0 * STEPS[0])
-    assert_velocity(velocities, second, 10.0 * STEPS[0])
+    assert second.motion.velocity is None
+    note_step(first, second, se3.exp(STEPS[0]))
+    assert_velocity(first, 10.0 * STEPS[0])
+    assert_velocity(second, 10.0 * STEPS[0])
     for _ in range(2):  # once more changes nothing
-        velocities.expect(second, third, se3.exp(STEPS[1]))
+        note_step(second, third, se3.exp(STEPS[1]))
         mean = 0.5 * (10.0 * STEPS[0] + 20.0 * STEPS[1])
-        assert_velocity(velocities, second, mean)
+        assert_velocity(second, mean)
         # A step and half of its change, before the first and after the last.
-        assert_velocity(velocities, first, 15.0 * STEPS[0] - 10.0 * STEPS[1])
-        assert_velocity(velocities, third, 30.0 * STEPS[1] - 5.0 * STEPS[0])
+        assert_velocity(first, 15.0 * STEPS[0] - 10.0 * STEPS[1])
+        assert_velocity(third, 30.0 * STEPS[1] - 5.0 * STEPS[0])
     # Neither a frame itself nor one a nanosecond later tells a velocity.
     for later in (third, Seen(third.stamp_ns + 1)):
-        velocities.expect(third, later, se3.exp(STEPS[1]))
-        assert_velocity(velocities, third, 30.0 * STEPS[1] - 5.0 * STEPS[0])
+        note_step(third, later, se3.exp(STEPS[1]))
+        assert_velocity(third, 30.0 * STEPS[1] - 5.0 * STEPS[0])
 
 
 def test_of_an_unknown_step_only_the_one_before_is_known() -> None:
     first, second, third = (Seen(stamp) for stamp in (0, 100_000_000, 200_000_000))
-    velocities = FrameVelocities()
-    velocities.expect(first, second, se3.exp(STEPS[0]))
-    velocities.expect(second, third, se3.exp(STEPS[1]))
-    velocities.expect(second, third, None)
-    assert_velocity(velocities, second, 10.0 * STEPS[0])
-    assert velocities.of(third) is None
-    velocities.expect(first, third, None)
-    assert velocities.of(first) is None
+    note_step(first, second, se3.exp(STEPS[0]))
+    note_step(second, third, se3.exp(STEPS[1]))
+    note_step(second, third, None)
+    assert_velocity(second, 10.0 * STEPS[0])
+    assert third.motion.velocity is None
+    note_step(first, third, None)
+    assert first.motion.velocity is None
 
 
 def test_the_velocity_of_a_frame_is_in_doubt_until_the_next_step_is_known() -> None:
     first, second, third = (Seen(stamp) for stamp in (0, 100_000_000, 200_000_000))
-    velocities = FrameVelocities()
-    assert velocities.sigmas(first) is None
-    velocities.expect(first, second, se3.exp(STEPS[0]))
+    assert first.motion.sigmas is None
+    note_step(first, second, se3.exp(STEPS[0]))
     # It may change along any axis, by a fifth; later by as much as it just did, and shift by less.
     of_step, change = 10.0 * STEPS[0], 10.0 * (STEPS[1] - STEPS[0])
     for frame, vector in ((second, 0.2 * of_step), (third, change / np.sqrt(3.0))):
         if frame is third:
-            velocities.expect(second, third, se3.exp(STEPS[1]))
-            assert velocities.sigmas(second) is None
+            note_step(second, third, se3.exp(STEPS[1]))
+            assert second.motion.sigmas is None
         turn, shift = np.linalg.norm(vector[:3]), 0.3 * np.linalg.norm(vector[3:])
-        sigmas = velocities.sigmas(frame)
+        sigmas = frame.motion.sigmas
         assert sigmas is not None
         np.testing.assert_allclose(sigmas, np.repeat([turn, shift], 3))
 
 
 def test_a_pose_is_off_by_what_is_learnt_of_its_velocity_later() -> None:
     first, second, third, fourth = (Seen(stamp) for stamp in range(0, 400_000_000, 100_000_000))
-    velocities = FrameVelocities()
-    velocities.expect(first, second, se3.exp(STEPS[0]))
-    velocities.expect(second, third, se3.exp(STEPS[1]))
-    extrapolated, sigmas = velocities.of(third), velocities.sigmas(third)
+    note_step(first, second, se3.exp(STEPS[0]))
+    note_step(second, third, se3.exp(STEPS[1]))
+    extrapolated, sigmas = third.motion.velocity, third.motion.sigmas
     assert extrapolated is not None
     assert sigmas is not None
     rng = np.random.default_rng(2)
@@ -371,29 +368,25 @@ def test_a_pose_is_off_by_what_is_learnt_of_its_velocity_later() -> None:
         ),
     )
     np.testing.assert_array_equal(measured.velocity, extrapolated + sigmas * np.arange(6))
-    velocities.measure(third, measured)
-    assert velocities.measured(third) is measured
-    assert_velocity(velocities, third, measured.velocity)
-    error = velocities.error(third)
+    third.motion.measure(measured)
+    assert third.motion.measured is measured
+    assert_velocity(third, measured.velocity)
+    error = third.motion.error()
     np.testing.assert_array_equal(error, 0.0)
-    assert not velocities.error(second).any()
-    velocities.expect(third, fourth, se3.exp(STEPS[0]))
+    assert not second.motion.error().any()
+    note_step(third, fourth, se3.exp(STEPS[0]))
     mean = 5.0 * (STEPS[1] + STEPS[0])
-    assert_velocity(velocities, third, mean)
-    assert velocities.measured(third) is None
-    place = Seen(third.stamp_ns)
-    velocities.copy(third, place)
-    for frame in (third, place):
-        error = velocities.error(frame)
-        change = (mean - measured.velocity) / sigmas
-        np.testing.assert_allclose(error, -measured.found.effects @ change)
+    assert_velocity(third, mean)
+    assert third.motion.measured is None
+    change = (mean - measured.velocity) / sigmas
+    np.testing.assert_allclose(third.motion.error(), -measured.found.effects @ change)
     # Where the next step fails, what was measured is the best that is known.
-    velocities.expect(third, fourth, None)
-    assert_velocity(velocities, third, measured.velocity)
+    note_step(third, fourth, None)
+    assert_velocity(third, measured.velocity)
     # Registered anew it is measured anew.
-    velocities.expect(second, third, se3.exp(STEPS[1]))
-    assert velocities.measured(third) is None
-    assert not velocities.error(third).any()
+    note_step(second, third, se3.exp(STEPS[1]))
+    assert third.motion.measured is None
+    assert not third.motion.error().any()
 
 
 def velocity_errors(seed: int) -> list[list[float]]:
@@ -410,7 +403,7 @@ def velocity_errors(seed: int) -> list[list[float]]:
         found = frontend.register(reference, current, prior)
         T = found.T_reference_current
         prior = MotionPrior(T_predicted=T, T_recent=T)
-        measured = frontend.rig_offsets.velocities.measured(current)
+        measured = current.motion.measured
         assert measured is not None
         if n > 1:  # of a first step nothing is extrapolated
             k = 2 * n
@@ -429,16 +422,6 @@ def test_rows_tell_the_velocity_of_the_newest_frame() -> None:
     assert by_rows < 0.95 * extrapolated
     # Where three quarters of what was extrapolated from steps of narrower thresholds are 0.0297.
     assert np.mean(errors[3], axis=0)[0] < 0.0297
-
-
-def test_velocities_are_forgotten_with_their_frames() -> None:
-    first, second = Seen(0), Seen(100_000_000)
-    velocities = FrameVelocities()
-    velocities.expect(first, second, np.eye(4))
-    del first
-    gc.collect()
-    assert velocities.of(second) is not None
-    assert len(velocities._velocities) == 1
 
 
 def screw(velocity: FloatArray, elapsed_s: float) -> FloatArray:
