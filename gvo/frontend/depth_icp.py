@@ -44,12 +44,9 @@ _MAX_BEND = 0.03
 _STRIDE = 3
 # Noise of a depth camera: so many metres, and so many per metre squared.
 _SIGMA_M, _SIGMA_PER_M = 0.003, 0.003
-# Largest residuals in sigmas, and one in how many points is enough: in the first
-# rounds, in later ones, and in the last, to which what is at rest goes at once.
+# Of each round, the largest residuals in sigmas, and one in how many points is enough.
 _ROUNDS = (*((4.0, 4),) * 2, *((2.5, 4),) * 3, (2.5, 1))
 _HUBER = 1.5
-# Squared length of a step, in sigmas, that no longer matters.
-_CONVERGED = 1e-2
 _MIN_POINTS = 200
 # Of what the best direction is told, this share may come from the noise of the normals.
 _MIN_SHARE = 2e-3
@@ -150,18 +147,13 @@ def align_depth_maps(
         variance.
     """
     T = se3.invert(T_reference_current)
-    is_settled = False
     for gate, every in _ROUNDS:
-        if is_settled and every > 1:
-            continue
         system = _linearize(T, reference, current, gate=gate, every=every)
         if isinstance(system, Failure):
             return system
         H, g, scale = system
         inverse, open_inverse = _invert(H, reference)
-        step = inverse @ g
-        T = se3.exp(step) @ T
-        is_settled = bool(step @ g < _CONVERGED)
+        T = se3.exp(inverse @ g) @ T
     covariance = _N_CORRELATED * scale**2 * (inverse + open_inverse)
     return RelativePose(
         T_reference_current=se3.normalize(se3.invert(T)),
@@ -267,12 +259,11 @@ def _is_simultaneous(frame: RgbdFrame) -> bool:
 
 # Disagreements that are remembered, and those needed to judge.
 _N_REMEMBERED, _N_NEEDED = 40, 10
-# Frames from one sample to the next: where depth is believed, while links are not judged yet, and
-# where colour agrees.
-_EVERY, _EVERY_FIRST, _EVERY_AGREEING = 3, 5, 21
-# Median squared disagreement, relative to that of normal errors, at which depth is believed, and
-# below which it no longer is.
-_CONTRADICTS, _AGREES = 16.0, 8.0
+# Frames from one sample to the next: as long as depth is believed or not judged yet, and where
+# colour agrees.
+_EVERY, _EVERY_AGREEING = 3, 21
+# Median squared disagreement, relative to that of normal errors, above which depth is believed.
+_CONTRADICTS = 16.0
 # Of chi-square of 6 degrees of freedom.
 _MEDIAN = 5.348
 
@@ -287,41 +278,33 @@ class DepthTrust:
     """
 
     def __init__(self) -> None:
-        self.is_on = False
-        """Whether depth is worth edges of its own."""
         self._n_unmeasured = 0
         self._squares: deque[float] = deque(maxlen=_N_REMEMBERED)
 
     @property
-    def disagreement(self) -> float:
-        """Squared disagreement, 1 for normal errors; 0 without enough measurements."""
-        squares = self._squares
-        return float(np.median(squares)) / _MEDIAN if len(squares) >= _N_NEEDED else 0.0
+    def variance_factor(self) -> float:
+        """By how much covariances of motions are too small, by colour and by depth; 1: not."""
+        if len(self._squares) < _N_NEEDED:
+            return 1.0
+        disagreement = float(np.median(self._squares)) / _MEDIAN
+        return disagreement if disagreement > _CONTRADICTS else 1.0
 
     @property
-    def variance_factor(self) -> float:
-        """By how much the covariances of motions are too small, those by colour and by depth."""
-        return max(self.disagreement, 1.0) if self.is_on else 1.0
+    def is_on(self) -> bool:
+        """Whether depth is worth edges of its own."""
+        return self.variance_factor > 1.0
 
     def is_due(self) -> bool:
         """Tell, once for each frame, whether its depth is to be aligned."""
         self._n_unmeasured += 1
-        is_judged = len(self._squares) >= _N_NEEDED
-        every = _EVERY if self.is_on else _EVERY_AGREEING if is_judged else _EVERY_FIRST
-        is_due = self._n_unmeasured >= every
-        if is_due:
-            self._n_unmeasured = 0
-        return is_due
+        agrees = len(self._squares) >= _N_NEEDED and not self.is_on
+        if self._n_unmeasured < (_EVERY_AGREEING if agrees else _EVERY):
+            return False
+        self._n_unmeasured = 0
+        return True
 
     def note(self, colour: RelativePose, depth: RelativePose) -> None:
         """Take a motion from a keyframe that was measured by both."""
         difference = se3.log(se3.invert(colour.T_reference_current) @ depth.T_reference_current)
         square = se3.mahalanobis(difference, colour.covariance + depth.covariance)
         self._squares.append(float(square))
-        self.is_on = self.disagreement > (_AGREES if self.is_on else _CONTRADICTS)
-
-    def widen(self, covariance: FloatArray) -> FloatArray | None:
-        """Return the covariance of an edge by depth; None where there is to be none, or not yet."""
-        if not self.is_on or len(self._squares) < _N_NEEDED:
-            return None
-        return self.variance_factor * covariance

@@ -433,10 +433,9 @@ class Odometry:
         if isinstance(depth, Failure):
             return None
         self._trust.note(RelativePose(T_reference_current=T, covariance=link.covariance), depth)
-        covariance = self._trust.widen(depth.covariance)
-        if covariance is None:
+        if not self._trust.is_on:
             return None
-        T = depth.T_reference_current
+        T, covariance = depth.T_reference_current, self._trust.variance_factor * depth.covariance
         return Edge(reference_id=link.reference_id, T_reference_frame=T, covariance=covariance)
 
     def _smooth(self, step: RawStep, links: _Links) -> tuple[Estimate, FloatArray | None]:
