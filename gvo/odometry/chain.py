@@ -301,6 +301,8 @@ class RawChain(Generic[ObservationsT]):
     ) -> RawStep:
         reference, stamp_ns = node.estimate, current.stamp_ns
         T, covariance = result.T_reference_current, result.covariance
+        # What the next step takes back is not chained: with it the raw NEES over 1 s of rendered
+        # hands with a rolling shutter falls from 0.6 to 0.4, and covariances are too large.
         lasting = variance_factor * (covariance - result.passing_covariance)
         estimate = poses.append(reference, stamp_ns, T, lasting)
         is_steady = self._note_velocity(poses, result, 1e-9 * (stamp_ns - reference.stamp_ns))
