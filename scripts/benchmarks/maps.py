@@ -17,6 +17,7 @@ import numpy as np
 
 from gvo import Config, RelativePose, StereoCamera
 from gvo.frontend.klt import KltPlace
+from gvo.frontend.rig import FrameMotion
 from gvo.geometry import se3
 from gvo.odometry.graph import RunGraph
 from gvo.odometry.loops import LoopDetector
@@ -97,6 +98,8 @@ class Frontend:
             patches=np.zeros((N_POINTS, 11, 11), np.uint8),
             descriptors_left=words ^ flipped,
             descriptors_wide=np.zeros_like(words),
+            depth_points=None,
+            motion=FrameMotion(),
         )
 
     def describe(self, place: KltPlace) -> KltPlace:

@@ -73,7 +73,7 @@ def test_an_edge_turned_twice_is_itself(seed: int) -> None:
 def test_covariances_are_those_of_samples() -> None:
     rng = np.random.default_rng(0)
     first, second = edge_of(1, sigma=2e-3), edge_of(2, "b", sigma=2e-3)
-    pairs = samples(first, rng, 2000), samples(second, rng, 2000)
+    pairs = samples(first, rng, 400), samples(second, rng, 400)
     joined, turned = then(first, second), inverse(first, "b")
     for edge, sampled in (
         (joined, pairs[0] @ pairs[1]),
@@ -81,7 +81,7 @@ def test_covariances_are_those_of_samples() -> None:
     ):
         expected = spread(sampled, edge.T_reference_frame)
         scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-        assert np.abs((edge.covariance - expected) / scale).max() < 0.1
+        assert np.abs((edge.covariance - expected) / scale).max() < 0.2
 
 
 @given(SEEDS, st.integers(2, 5))
