@@ -344,8 +344,8 @@ def main() -> int:
         code = pytest.main([*options, *tests], plugins=[mutation])
     if mutation.n_run == 0:
         failing = f"without a mutant this fails: {mutation.reason}"
-        nothing = f"no mutant could be run (pytest ended with {int(code)})"
-        print(f"mutation: {failing if mutation.reason else nothing}", file=sys.stderr)
+        unable = f"no mutant could be run (pytest ended with {int(code)})"
+        print(f"mutation: {failing if mutation.reason else unable}", file=sys.stderr)
         return 2
     n_killed = mutation.n_run - len(mutation.survivors)
     low, high = binomtest(n_killed, mutation.n_run).proportion_ci(method="wilson")
