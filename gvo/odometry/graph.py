@@ -325,20 +325,17 @@ class RunGraph:
         # Such a world repeats itself, and across a gap odometry cannot tell which are false.
         n_confirmed = len(chain.loops) + len(chain.too_far)
         if 2 * len(reasons) > n_confirmed:
-            across = (
-                x for x in chain.loops if self.parts.of(x.stamp_ns) != self.parts.of(x.reference_ns)
-            )
-            reasons = dict.fromkeys(map(_ends, across), _DOUBTED) | reasons
+            across = map(_ends, filter(self._is_across, chain.loops))
+            reasons = dict.fromkeys(across, _DOUBTED) | reasons
         return reasons
+
+    def _is_across(self, loop: Loop) -> bool:
+        """Tell whether a loop leads from one part to another."""
+        return self.parts.of(loop.stamp_ns) != self.parts.of(loop.reference_ns)
 
     def _whole(self, frames_ns: Sequence[int], loops: Sequence[Loop]) -> WholeGraph:
         """Return the graph of some frames; a guess is an edge only where nothing else connects."""
-        graph, parts = WholeGraph(), Parts()
-        poses = {ns: self.path.pose(ns) for ns in frames_ns}
-        origin = PosePrior(T_world_frame=poses[frames_ns[0]], covariance=ORIGIN.covariance)
-        for ns in frames_ns:
-            graph.add_pose(ns, ns, origin if ns == frames_ns[0] else None)
-            graph.given[ns] = poses[ns]
+        graph, parts = _graph_of(frames_ns, map(self.path.pose, frames_ns)), Parts()
         for (reference_ns, frame_ns), edges in self._edges.items():
             graph.add_edges(frame_ns, edges)
             parts.join(reference_ns, frame_ns)
@@ -359,7 +356,7 @@ class RunGraph:
         """
         ratios = []
         for loop in loops:
-            if self.parts.of(loop.stamp_ns) == self.parts.of(loop.reference_ns):
+            if not self._is_across(loop):
                 way = self._way_of(loop, ways)
                 ratios.append(chi2(loop.edge, way.T, way.covariance) / 6.0)
         factor = float(np.median(ratios)) if ratios else 1.0
@@ -407,13 +404,7 @@ class _Chain(NamedTuple):
 
     def judge(self) -> _Verdict:
         """Find out which loops fit together with odometry, which may drift, and with each other."""
-        graph, n = WholeGraph(), len(self.ends_ns)
-        origin = PosePrior(T_world_frame=self.T_world_ends[0], covariance=ORIGIN.covariance)
-        for k, (stamp_ns, T_world_end) in enumerate(
-            zip(self.ends_ns, self.T_world_ends, strict=True)
-        ):
-            graph.add_pose(stamp_ns, stamp_ns, None if k else origin)
-            graph.given[stamp_ns] = T_world_end
+        graph, n = _graph_of(self.ends_ns, self.T_world_ends), len(self.ends_ns)
         # of all ways alike: the sigmas of their drifts add up
         covariances = self.ways.covariance + (n - 1) * self.ways.drift
         for (before_ns, end_ns), T, covariance in zip(
@@ -426,6 +417,17 @@ class _Chain(NamedTuple):
         optimizer.run()
         refused = {(self.ends_ns[a], self.ends_ns[b]) for a, b, _ in optimizer.refused}
         return _Verdict(refused, optimizer.poses()[-1] @ se3.invert(self.T_world_ends[-1]))
+
+
+def _graph_of(stamps_ns: Iterable[int], poses: Iterable[FloatArray]) -> WholeGraph:
+    """Return a graph of frames where they are, without edges; the first one is held there."""
+    graph = WholeGraph()
+    for stamp_ns, T_world_frame in zip(stamps_ns, poses, strict=True):
+        is_first = not graph.frame_ids
+        origin = PosePrior(T_world_frame=T_world_frame, covariance=ORIGIN.covariance)
+        graph.add_pose(stamp_ns, stamp_ns, origin if is_first else None)
+        graph.given[stamp_ns] = T_world_frame
+    return graph
 
 
 def _is_allowed(loop: Loop, way: Way) -> bool:

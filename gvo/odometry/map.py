@@ -150,7 +150,7 @@ class Map(Generic[ObservationsT]):
             return None
         loop, path, there = loops[-1], self.graph.path, self._parts.of(loops[-1].reference_ns)
         kept = [ns for ns in self.unjoined_ns if ns in self._window and self._parts.of(ns) == there]
-        if not kept or loop.stamp_ns in path:
+        if not kept:
             return None
         reference_ns = loop.reference_ns
         nearest = min(kept, key=lambda ns: abs(ns - reference_ns))
