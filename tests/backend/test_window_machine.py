@@ -164,9 +164,11 @@ class WindowMachine(RuleBasedStateMachine):
         step = np.array([0.0, 0.03, 0.0, 0.0, 0.0, 0.3]) + 0.02 * self.rng.normal(size=6)
         newest = self.truths.get(frame - 1, np.eye(4))
         self.truths[frame] = newest @ se3.exp(step) if frame else newest
+        if not has_poses(self):
+            wanted = []
         edges = [
             self.measure(self.pick(number), frame, quality, sigma, how)
-            for number, quality, sigma, how in (wanted if has_poses(self) else [])
+            for number, quality, sigma, how in wanted
         ]
         given = self.make_prior(frame, prior)
         self.stamps[frame] = stamp
