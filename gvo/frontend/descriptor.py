@@ -257,8 +257,8 @@ class DescriptorFrontend:
         measured = Correspondences.of(reference, current, matches)
         return Measurements(
             frames=(reference, current),
-            uvd=(measured.source_uvd, measured.target_uvd),
-            sigmas=(measured.source_sigmas, measured.target_sigmas),
+            uvd=(measured.reference_uvd, measured.current_uvd),
+            sigmas=(measured.reference_sigmas, measured.current_sigmas),
             matches=matches,
             sigma_factor=_SIGMA_FACTOR,
         )

@@ -379,10 +379,10 @@ class KltFrontend:
         disparities, is_valid = self._measure(current.frame, pixels, expected, search)
         valid = np.flatnonzero(is_valid)
         indices = expected.indices.take(valid)
-        target_uvd = np.column_stack([pixels, disparities]).take(valid, axis=0)
+        current_uvd = np.column_stack([pixels, disparities]).take(valid, axis=0)
         return Measurements(
             frames=(reference, current),
-            uvd=(reference.uvd.take(indices, axis=0), target_uvd),
+            uvd=(reference.uvd.take(indices, axis=0), current_uvd),
             sigmas=self._sigmas(len(indices)),
             matches=np.column_stack([indices, np.full_like(indices, -1)]),
             sigma_factor=KLT_SIGMA_FACTOR,

@@ -75,7 +75,6 @@ def register_correspondences(
     Parameters
     ----------
     correspondences : Correspondences
-        Source is the reference, target the current frame.
     matches : ndarray of int64, shape (n, 2)
         Handed through to the result.
     camera : StereoCamera
@@ -89,14 +88,14 @@ def register_correspondences(
         from it, and chooses its inliers anew (not with `registration.refine` none, where the fit
         to the consensus is the result).
     T_start : ndarray of float64, shape (4, 4), optional
-        T_target_source that is used so in place of the prediction.
+        T_reference_current that is used so in place of the prediction.
 
     Returns
     -------
     RelativePose or Failure
     """
     if prior is not None and T_start is None:
-        T_start = se3.invert(prior.T_predicted)
+        T_start = prior.T_predicted
     consensus = find_consensus(correspondences, camera, config, stamps_ns, T_start)
     if isinstance(consensus, Failure):
         return consensus
@@ -118,15 +117,15 @@ def estimate_roughly(
     stamps_ns: tuple[int, int],
     prior: MotionPrior | None,
 ) -> FloatArray | Failure:
-    """Return T_target_source after a few steps, not verified; as `register_correspondences`."""
+    """Return T_reference_current after a few steps, not verified; as `register_correspondences`."""
     thresholds = "inlier_threshold_px", "inlier_threshold_m"
     wide = {name: _ROUGH_FACTOR * getattr(config.ransac, name) for name in thresholds}
     config = config.model_copy(update={"ransac": config.ransac.model_copy(update=wide)})
-    T = None if prior is None else se3.invert(prior.T_predicted)
+    T = None if prior is None else prior.T_predicted
     found = find_consensus(correspondences, camera, config, stamps_ns, T)
     if isinstance(found, Failure):
         return found
-    T = found.T_target_source
+    T = found.T_reference_current
     residuals = StereoResiduals.of(T, correspondences, camera)
     refined = descend(T, residuals.select(found.inliers), n_iterations=_N_ROUGH_ITERATIONS)
     return T if refined is None else refined
@@ -141,7 +140,7 @@ def find_consensus(
 ) -> Consensus | Failure:
     """Return the start value if most matches agree with it, else what RANSAC finds.
 
-    Arguments are those of `register_correspondences`; the start is a T_target_source.
+    Arguments are those of `register_correspondences`; the start is a T_reference_current.
     """
     known = _known_consensus(T_start, correspondences, camera, config)
     return known or _search_consensus(correspondences, camera, config, stamps_ns)
@@ -157,14 +156,14 @@ def _known_consensus(
     n_needed = max(config.ransac.min_inliers, _MIN_KNOWN_SHARE * len(correspondences))
     if np.count_nonzero(inliers) < n_needed:
         return None
-    return Consensus(T_target_source=T, inliers=inliers)
+    return Consensus(T_reference_current=T, inliers=inliers)
 
 
 def _refine(
     consensus: Consensus, correspondences: Correspondences, camera: StereoCamera, config: Config
 ) -> Refinement | Failure:
     refine = fit_covariance if config.registration.refine == "none" else refine_pose
-    return refine(consensus.T_target_source, correspondences, consensus.inliers, camera)
+    return refine(consensus.T_reference_current, correspondences, consensus.inliers, camera)
 
 
 def _conclude(
@@ -216,20 +215,20 @@ def _relative_pose(
     refined: Refinement, correspondences: Correspondences, matches: IntArray
 ) -> RelativePose:
     return RelativePose(
-        T_reference_current=se3.invert(refined.T_target_source),
+        T_reference_current=refined.T_reference_current,
         covariance=refined.covariance,
         matches=matches,
         inliers=refined.inliers,
-        pixels_reference=correspondences.source_uvd[:, :2],
-        pixels_current=correspondences.target_uvd[:, :2],
-        points_current=correspondences.target_points,
+        pixels_reference=correspondences.reference_uvd[:, :2],
+        pixels_current=correspondences.current_uvd[:, :2],
+        points_current=correspondences.current_points,
         flow_px=_flow(correspondences, refined.inliers),
         calibration_errors=refined.calibration_errors,
     )
 
 
 def _flow(correspondences: Correspondences, inliers: BoolArray) -> float:
-    displacements = correspondences.target_uvd[:, :2] - correspondences.source_uvd[:, :2]
+    displacements = correspondences.current_uvd[:, :2] - correspondences.reference_uvd[:, :2]
     return float(np.median(np.hypot(*displacements[inliers].T)))
 
 
@@ -238,7 +237,7 @@ def _weights(correspondences: Correspondences, config: Config) -> FloatArray | N
         return None
     # Depth noise grows with z^2; 1/z^2 as a weight keeps near points in the lead without
     # giving up the far ones, which hold the rotation.
-    return np.asarray(1.0 / correspondences.target_points[:, 2] ** 2)
+    return np.asarray(1.0 / correspondences.current_points[:, 2] ** 2)
 
 
 def match_anywhere(reference: Sequence[NDArray[Any]], current: Sequence[NDArray[Any]]) -> IntArray:

@@ -237,8 +237,7 @@ class FrameMotion:
         told = self.told
         if told is None or self.velocity is None:
             return np.zeros(6)
-        # The pose is the inverse of the step: what is left of one is right of the other.
-        return -told.found.effects @ ((self.velocity - told.velocity) / told.sigmas)
+        return told.found.effects @ ((self.velocity - told.velocity) / told.sigmas)
 
 
 class Moving(Protocol):
@@ -608,7 +607,7 @@ class CalibratedCamera:
     def begin(
         self, measured: Measurements, config: Config, *, prior: MotionPrior | None, is_step: bool
     ) -> FloatArray | None:
-        """Take over the velocities of a step, estimated roughly; return it, T_target_source.
+        """Take over the velocities of a step, estimated roughly; return it, T_reference_current.
 
         None where rows need no velocities, or where that fails.
         """
@@ -632,7 +631,7 @@ class CalibratedCamera:
     def _move_rows(
         self, measured: Measurements, config: Config, hints: Mapping[str, Any]
     ) -> FloatArray | None:
-        """Take over the velocities of both frames by a rough step; return that, T_target_source.
+        """Take over the velocities of both frames by a rough step; return its T_reference_current.
 
         What fails, None, is tried again as a whole, to tell why.
         """
@@ -640,13 +639,13 @@ class CalibratedCamera:
         rough = estimate_roughly(self._corrected(measured), self._camera, config, **hints)
         if isinstance(rough, Failure):
             return None
-        note_step(*frames, se3.invert(rough))
+        note_step(*frames, rough)
         told = self._measure_velocity(measured, rough, config)
         if told is None:
             return rough
-        note_step(*frames, se3.invert(told.found.T_target_source))
+        note_step(*frames, told.found.T_reference_current)
         frames[1].motion.measure(told)
-        return told.found.T_target_source
+        return told.found.T_reference_current
 
     def _register(
         self, measured: Measurements, config: Config, hints: Mapping[str, Any]
@@ -716,8 +715,8 @@ class CalibratedCamera:
         self, corrected: Correspondences, sigmas: FloatArray, readout_s: float
     ) -> dict[str, FloatArray]:
         """Return the derivatives of corrected measurements by errors of the current velocity."""
-        rates = pose_jacobian(corrected.target_points.T, self._camera)
-        rates *= -readout_s * _row_times(corrected.target_uvd[:, 1], self._camera)
+        rates = pose_jacobian(corrected.current_points.T, self._camera)
+        rates *= readout_s * _row_times(corrected.current_uvd[:, 1], self._camera)
         rates *= sigmas[:, np.newaxis, np.newaxis]
         both = np.swapaxes(np.stack([np.zeros_like(rates), rates], axis=1), 2, 3)
         return dict(zip(_VELOCITIES, both, strict=True))
@@ -756,7 +755,7 @@ class CalibratedCamera:
         self._accepted = []
         links = told_by[1:]
         for measured, result in links or (told_by if self._offsets.possible_readout_s else ()):
-            T = se3.invert(result.T_reference_current)
+            T = result.T_reference_current
             prepared = self.prepare(measured, None)
             residuals = StereoResiduals.of(T, prepared, self._camera).select(result.inliers)
             at = residuals.linearize(T)

@@ -50,8 +50,8 @@ _STEPS = np.vstack([steps_around(RADIUS_PX, RADIUS_PX), np.ones((2 * RADIUS_PX +
 # Variance of a gradient that is noise, grey values squared: keeps flat patches from dividing by
 # nothing.
 _NOISE = 1.0
-# Distance to a plane, as a share of the source's, below which the target is at it or behind it; and
-# the steepest slope that a surface has in the target.
+# Distance to a plane, as a share of the reference's, below which the current camera is at it or
+# behind it; and the steepest slope that a surface has in the current image.
 _MIN_DISTANCE = 0.05
 _MAX_SLOPE = 0.75
 # An alignment makes so many steps; as many again are made by patches that the last of them moved by
@@ -228,7 +228,7 @@ def halve(image: ImageArray) -> ImageArray:
 
 
 def patch_warps(
-    uvd: FloatArray, slopes: FloatArray, T_target_source: FloatArray, camera: StereoCamera
+    uvd: FloatArray, slopes: FloatArray, T_current_reference: FloatArray, camera: StereoCamera
 ) -> FloatArray:
     """Return by how much patches of surfaces are turned, stretched and sheared by a motion.
 
@@ -238,11 +238,11 @@ def patch_warps(
     Parameters
     ----------
     uvd : ndarray of float64, shape (n, 3)
-        Pixels of the source and their disparities.
+        Pixels of the reference and their disparities.
     slopes : ndarray of float64, shape (n, 2)
         Change of the disparity per pixel, along rows and columns; zero where a surface faces the
         camera.
-    T_target_source : ndarray of float64, shape (4, 4)
+    T_current_reference : ndarray of float64, shape (4, 4)
         Motion, metres.
     camera : StereoCamera
         Of both.
@@ -250,12 +250,12 @@ def patch_warps(
     Returns
     -------
     ndarray of float64, shape (n, 2, 2)
-        Derivative of the target's pixel (u, v) by the source's.
+        Derivative of the current pixel (u, v) by the reference's.
     """
     f = np.array([camera.fx, camera.fy])
     rays = np.ones((len(uvd), 3))
     rays[:, :2] = (uvd[:, :2] - [camera.cx, camera.cy]) / f
-    R, t = T_target_source[:3, :3], T_target_source[:3, 3]
+    R, t = T_current_reference[:3, :3], T_current_reference[:3, 3]
     inverse_depths = uvd[:, 2] / (camera.fx * camera.baseline)
     points = rays @ R.T + inverse_depths[:, np.newaxis] * t
     inverse_slopes = slopes / (camera.fx * camera.baseline)
@@ -268,19 +268,19 @@ def patch_warps(
 
 
 def move_slopes(
-    uvd: FloatArray, slopes: FloatArray, T_target_source: FloatArray, camera: StereoCamera
+    uvd: FloatArray, slopes: FloatArray, T_current_reference: FloatArray, camera: StereoCamera
 ) -> FloatArray:
-    """Return the slopes of the disparities of surfaces in the target's image, shape (n, 2).
+    """Return the slopes of the disparities of surfaces in the current image, shape (n, 2).
 
     A plane n . p = 1, whose inverse depth is n . x for a ray x, becomes R n / (1 + t . R n).
 
     Parameters
     ----------
     uvd : ndarray of float64, shape (n, 3)
-        Pixels of the source and their disparities.
+        Pixels of the reference and their disparities.
     slopes : ndarray of float64, shape (n, 2)
-        Change of the disparity per pixel in the source, along rows and columns.
-    T_target_source : ndarray of float64, shape (4, 4)
+        Change of the disparity per pixel in the reference, along rows and columns.
+    T_current_reference : ndarray of float64, shape (4, 4)
         Motion, metres.
     camera : StereoCamera
         Of both.
@@ -291,8 +291,8 @@ def move_slopes(
     normals[:, :2] = slopes * scales
     inverse_depths = uvd[:, 2] / (camera.fx * camera.baseline)
     normals[:, 2] = inverse_depths - np.einsum("ni,ni->n", normals[:, :2], rays)
-    normals = normals @ T_target_source[:3, :3].T
-    distances = 1.0 + normals @ T_target_source[:3, 3]
+    normals = normals @ T_current_reference[:3, :3].T
+    distances = 1.0 + normals @ T_current_reference[:3, 3]
     moved = normals[:, :2] / np.maximum(distances, _MIN_DISTANCE)[:, np.newaxis]
     return np.clip(moved / scales, -_MAX_SLOPE, _MAX_SLOPE)
 

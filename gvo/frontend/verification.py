@@ -26,7 +26,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from gvo.config import Config
-from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.ransac import ransac_rigid
@@ -79,7 +78,7 @@ class _Problem:
         """Return the median distance of the points as two motions project them."""
         pixels = []
         for T in (T_first, T_second):
-            points = self.matches.source_points @ T[:3, :3].T + T[:3, 3]
+            points = (self.matches.reference_points - T[:3, 3]) @ T[:3, :3]
             points[:, 2] = np.maximum(points[:, 2], _MIN_DEPTH_M)
             pixels.append(self.camera.project(points))
         return float(np.median(np.hypot(*(pixels[0] - pixels[1]).T)))
@@ -116,11 +115,11 @@ def verify_motion(
         The motion found, or the second one; a failure where nothing tells which one it is.
     """
     problem = _Problem(matches=matches, camera=camera, config=config)
-    T_predicted = None if prior is None else se3.invert(prior.T_predicted)
+    T_predicted = None if prior is None else prior.T_predicted
     verified = _prefer_predicted_motion(found, problem, T_predicted, make_rng)
     if isinstance(verified, Failure) or prior is None or prior.T_recent is None:
         return verified
-    return _prefer_recent_motion(verified, problem, se3.invert(prior.T_recent))
+    return _prefer_recent_motion(verified, problem, prior.T_recent)
 
 
 def _prefer_predicted_motion(
@@ -135,15 +134,15 @@ def _prefer_predicted_motion(
     if second is None or isinstance(second, Failure):
         return first
     # Without the others' matches the first motion is no compromise any more.
-    is_second = first.residuals.within(second.T_target_source, GATE)
+    is_second = first.residuals.within(second.T_reference_current, GATE)
     rest = first.inliers & ~is_second
     if np.count_nonzero(rest) >= problem.n_needed:
-        alone = problem.refine(first.T_target_source, rest)
+        alone = problem.refine(first.T_reference_current, rest)
         first = first if isinstance(alone, Failure) else alone
     return _decide(
         _group(first, problem, T_predicted),
         _group(second, problem, T_predicted),
-        apart_px=problem.distance_px(first.T_target_source, second.T_target_source),
+        apart_px=problem.distance_px(first.T_reference_current, second.T_reference_current),
         n_needed=problem.n_needed,
     )
 
@@ -156,7 +155,7 @@ def _find_other(
 ) -> tuple[FloatArray, BoolArray] | None:
     """Return a second motion, roughly, and the matches that fit it alone; None where few do."""
     residuals, n_needed = first.residuals, problem.n_needed
-    squared = residuals.squared(first.T_target_source)
+    squared = residuals.squared(first.T_reference_current)
     misfits = squared >= GATE**2
     if np.count_nonzero(misfits) < n_needed:
         return None
@@ -185,7 +184,7 @@ def _sample_motion(
 ) -> FloatArray | None:
     matches, ransac = problem.matches.select(misfits), problem.config.ransac
     found = ransac_rigid(matches, problem.camera, ransac, weights=None, rng=rng)
-    return None if isinstance(found, Failure) else found.T_target_source
+    return None if isinstance(found, Failure) else found.T_reference_current
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -202,7 +201,7 @@ class _Group:
 
 
 def _group(refined: Refinement, problem: _Problem, T_predicted: FloatArray | None) -> _Group:
-    T = refined.T_target_source
+    T = refined.T_reference_current
     return _Group(
         refined=refined,
         fitting=refined.residuals.within(T, GATE),
@@ -245,7 +244,7 @@ def _prefer_recent_motion(found: Refinement, problem: _Problem, T_recent: FloatA
     Only where the motion found left it: a tenth of the matches must fit another motion alone,
     which is nearer to the recent one by a factor of two.
     """
-    squared = found.residuals.squared(found.T_target_source)
+    squared = found.residuals.squared(found.T_reference_current)
     recently = found.residuals.squared(T_recent)
     seeds = recently < _BETTER**2 * squared
     if np.count_nonzero(seeds) < problem.n_needed:
@@ -261,7 +260,7 @@ def _prefer_recent_motion(found: Refinement, problem: _Problem, T_recent: FloatA
         return found
     supporters = misfits & found.residuals.within(T_other, gate)
     is_enough = np.count_nonzero(supporters) >= problem.n_needed
-    if not (is_enough and _is_continued(T_other, found.T_target_source, T_recent, problem)):
+    if not (is_enough and _is_continued(T_other, found.T_reference_current, T_recent, problem)):
         return found
     second = problem.refine(T_other, supporters, gate=gate)
     return found if isinstance(second, Failure) else second

@@ -17,40 +17,42 @@ class Correspondences:
 
     Parameters
     ----------
-    source_points, target_points : ndarray of float64, shape (n, 3)
-        The same points in the camera frames of source and target, metres.
-    source_uvd, target_uvd : ndarray of float64, shape (n, 3)
+    reference_points, current_points : ndarray of float64, shape (n, 3)
+        The same points in the camera frames of reference and current, metres.
+    reference_uvd, current_uvd : ndarray of float64, shape (n, 3)
         Pixel and disparity measured in either frame, pixels.
-    source_sigmas, target_sigmas : ndarray of float64, shape (n, 3)
+    reference_sigmas, current_sigmas : ndarray of float64, shape (n, 3)
         Standard deviations of these, pixels.
     sensitivities : mapping of str to ndarray of float64, shape (2, n, 3)
-        Derivatives of the measurements in source and target by the errors of constants of the
-        camera that a registration is to estimate, by name; in units of their present sigmas.
+        Derivatives of the measurements in reference and current frame by the errors of constants
+        of the camera that a registration is to estimate, by name; in units of their sigmas.
     """
 
-    source_points: FloatArray
-    target_points: FloatArray
-    source_uvd: FloatArray
-    target_uvd: FloatArray
-    source_sigmas: FloatArray
-    target_sigmas: FloatArray
+    reference_points: FloatArray
+    current_points: FloatArray
+    reference_uvd: FloatArray
+    current_uvd: FloatArray
+    reference_sigmas: FloatArray
+    current_sigmas: FloatArray
     sensitivities: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Return the number of correspondences."""
-        return len(self.source_points)
+        return len(self.reference_points)
 
     @classmethod
-    def of(cls, source: Observations, target: Observations, matches: IntArray) -> Correspondences:
+    def of(
+        cls, reference: Observations, current: Observations, matches: IntArray
+    ) -> Correspondences:
         """Gather matched observations of two frames; matches (n, 2) are pairs of indices."""
         i, j = matches.T
         return cls(
-            source_points=source.points_cam[i],
-            target_points=target.points_cam[j],
-            source_uvd=np.column_stack([source.keypoints[i], source.disparities[i]]),
-            target_uvd=np.column_stack([target.keypoints[j], target.disparities[j]]),
-            source_sigmas=source.sigmas[i],
-            target_sigmas=target.sigmas[j],
+            reference_points=reference.points_cam[i],
+            current_points=current.points_cam[j],
+            reference_uvd=np.column_stack([reference.keypoints[i], reference.disparities[i]]),
+            current_uvd=np.column_stack([current.keypoints[j], current.disparities[j]]),
+            reference_sigmas=reference.sigmas[i],
+            current_sigmas=current.sigmas[j],
         )
 
     @classmethod
@@ -60,17 +62,17 @@ class Correspondences:
         sigmas: tuple[FloatArray, FloatArray],
         camera: StereoCamera,
     ) -> Correspondences:
-        """Back-project measurements (n, 3) in source and target, with their sigmas (n, 3)."""
-        source_points, target_points = (
+        """Back-project measurements (n, 3) in reference and current, with their sigmas (n, 3)."""
+        reference_points, current_points = (
             camera.unproject_stereo(each[:, :2], each[:, 2]) for each in uvd
         )
         return cls(
-            source_points=source_points,
-            target_points=target_points,
-            source_uvd=uvd[0],
-            target_uvd=uvd[1],
-            source_sigmas=sigmas[0],
-            target_sigmas=sigmas[1],
+            reference_points=reference_points,
+            current_points=current_points,
+            reference_uvd=uvd[0],
+            current_uvd=uvd[1],
+            reference_sigmas=sigmas[0],
+            current_sigmas=sigmas[1],
         )
 
     def without_offset(self, offset_px: float, camera: StereoCamera) -> Correspondences:
@@ -78,17 +80,17 @@ class Correspondences:
         if offset_px == 0.0:
             return self
         offset = np.array([0.0, 0.0, offset_px])
-        uvd = self.source_uvd - offset, self.target_uvd - offset
-        return Correspondences.of_pixels(uvd, (self.source_sigmas, self.target_sigmas), camera)
+        uvd = self.reference_uvd - offset, self.current_uvd - offset
+        return Correspondences.of_pixels(uvd, (self.reference_sigmas, self.current_sigmas), camera)
 
     def select(self, chosen: BoolArray | IntArray) -> Correspondences:
         """Return some of the correspondences."""
         return Correspondences(
-            source_points=self.source_points[chosen],
-            target_points=self.target_points[chosen],
-            source_uvd=self.source_uvd[chosen],
-            target_uvd=self.target_uvd[chosen],
-            source_sigmas=self.source_sigmas[chosen],
-            target_sigmas=self.target_sigmas[chosen],
+            reference_points=self.reference_points[chosen],
+            current_points=self.current_points[chosen],
+            reference_uvd=self.reference_uvd[chosen],
+            current_uvd=self.current_uvd[chosen],
+            reference_sigmas=self.reference_sigmas[chosen],
+            current_sigmas=self.current_sigmas[chosen],
             sensitivities={name: each[:, chosen] for name, each in self.sensitivities.items()},
         )

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gvo.config import RansacConfig
+from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.umeyama import fit_rigid, fit_rigid_triples
@@ -30,13 +31,13 @@ class Consensus:
 
     Parameters
     ----------
-    T_target_source : ndarray of float64, shape (4, 4)
+    T_reference_current : ndarray of float64, shape (4, 4)
         Refitted to the inliers.
     inliers : ndarray of bool, shape (n,)
         The correspondences that agree with it.
     """
 
-    T_target_source: FloatArray
+    T_reference_current: FloatArray
     inliers: BoolArray
 
 
@@ -55,7 +56,7 @@ def ransac_rigid(
     correspondences : Correspondences
         Putative matches.
     camera : StereoCamera
-        Of the target frame; used by the `reprojection` metric.
+        Of the current frame; used by the `reprojection` metric.
     config : RansacConfig
         Maximum number of hypotheses, metric, thresholds.
     weights : ndarray of float64, shape (n,), optional
@@ -95,7 +96,7 @@ def _search(
     for n_before in range(0, len(samples), _BLOCK):
         block = samples[n_before : n_before + _BLOCK]
         T, is_valid = fit_rigid_triples(
-            correspondences.source_points[block], correspondences.target_points[block]
+            correspondences.reference_points[block], correspondences.current_points[block]
         )
         if not is_valid.any():
             continue
@@ -113,7 +114,7 @@ def _search(
 
 def _near(correspondences: Correspondences, config: RansacConfig) -> IntArray:
     """Return the indices of points near enough to fit; all if those are too few."""
-    disparities = np.minimum(correspondences.source_uvd[:, 2], correspondences.target_uvd[:, 2])
+    disparities = np.minimum(correspondences.reference_uvd[:, 2], correspondences.current_uvd[:, 2])
     near = np.flatnonzero(disparities >= config.min_disparity_px)
     return near if len(near) >= config.min_inliers else np.arange(len(disparities))
 
@@ -130,7 +131,7 @@ def draw_samples(n: int, n_samples: int, rng: np.random.Generator) -> IntArray:
 
 
 def find_inliers(
-    T_target_source: FloatArray,
+    T_reference_current: FloatArray,
     correspondences: Correspondences,
     camera: StereoCamera,
     config: RansacConfig,
@@ -139,7 +140,7 @@ def find_inliers(
 
     Parameters
     ----------
-    T_target_source : ndarray of float64, shape (m, 4, 4)
+    T_reference_current : ndarray of float64, shape (m, 4, 4)
         The hypotheses.
 
     Returns
@@ -147,16 +148,16 @@ def find_inliers(
     ndarray of bool, shape (m, n)
     """
     # Single precision halves the time; its error (1e-4 px) is far below any threshold.
-    R = T_target_source[:, :3, :3].transpose(1, 0, 2).astype(np.float32)
-    t = T_target_source[:, :3, 3].T.astype(np.float32)
-    source = correspondences.source_points.T.astype(np.float32)
-    moved = (R.reshape(-1, 3) @ source).reshape(3, len(T_target_source), -1)
-    moved += t[:, :, np.newaxis]
+    T = se3.invert(T_reference_current).astype(np.float32)
+    points = correspondences.reference_points.T.astype(np.float32)
+    R = T[:, :3, :3].transpose(1, 0, 2).reshape(-1, 3)
+    moved = (R @ points).reshape(3, len(T), -1)
+    moved += T[:, :3, 3].T[:, :, np.newaxis]
     if config.inlier_metric == "distance":
-        target = correspondences.target_points.T.astype(np.float32)
-        squared = np.sum((moved - target[:, np.newaxis]) ** 2, axis=0)
+        measured = correspondences.current_points.T.astype(np.float32)
+        squared = np.sum((moved - measured[:, np.newaxis]) ** 2, axis=0)
         return np.asarray(squared < config.inlier_threshold_m**2)
-    return _reprojects(moved, correspondences.target_uvd, camera, config.inlier_threshold_px)
+    return _reprojects(moved, correspondences.current_uvd, camera, config.inlier_threshold_px)
 
 
 def _reprojects(
@@ -207,8 +208,8 @@ def _refit(
     if len(fitted) < config.min_inliers:
         fitted = np.flatnonzero(inliers)
     T = fit_rigid(
-        correspondences.source_points[fitted],
-        correspondences.target_points[fitted],
+        correspondences.reference_points[fitted],
+        correspondences.current_points[fitted],
         weights=None if weights is None else weights[fitted],
     )
     if isinstance(T, Failure):
@@ -216,4 +217,4 @@ def _refit(
     again = find_inliers(T[np.newaxis], correspondences, camera, config)[0]
     if np.count_nonzero(again) < config.min_inliers:
         again = inliers
-    return Consensus(T_target_source=T, inliers=again)
+    return Consensus(T_reference_current=T, inliers=again)

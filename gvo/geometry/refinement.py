@@ -59,7 +59,7 @@ _N_PROMISED = 24
 _MAX_LOSS = 10.0
 # The first round only has to be good enough to choose the inliers again.
 _N_FIRST_ITERATIONS = 2
-# Information on a constant, relative to that of the target's measurements alone, below which it is
+# Information on a constant, relative to that of the current measurements alone, below which it is
 # rounding.
 _MIN_SHARE = 1e-10
 _IDENTITY = np.eye(6)
@@ -72,10 +72,9 @@ class Refinement:
 
     Parameters
     ----------
-    T_target_source : ndarray of float64, shape (4, 4)
+    T_reference_current : ndarray of float64, shape (4, 4)
     covariance : ndarray of float64, shape (6, 6)
-        Of (rx, ry, rz, tx, ty, tz), left perturbation of T_target_source, that is right
-        perturbation of its inverse.
+        Of (rx, ry, rz, tx, ty, tz), right perturbation.
     inliers : ndarray of bool, shape (n,)
         The matches used.
     scale : float
@@ -86,7 +85,7 @@ class Refinement:
         See `estimate_constants`.
     """
 
-    T_target_source: FloatArray
+    T_reference_current: FloatArray
     covariance: FloatArray
     inliers: BoolArray
     scale: float
@@ -95,7 +94,7 @@ class Refinement:
 
 
 def refine_pose(
-    T_target_source: FloatArray,
+    T_reference_current: FloatArray,
     matches: Correspondences,
     inliers: BoolArray,
     camera: StereoCamera,
@@ -110,7 +109,7 @@ def refine_pose(
 
     Parameters
     ----------
-    T_target_source : ndarray of float64, shape (4, 4)
+    T_reference_current : ndarray of float64, shape (4, 4)
         Start value.
     matches : Correspondences
         All n putative matches.
@@ -128,11 +127,11 @@ def refine_pose(
     Refinement or Failure
         A failure if a direction of motion is unobservable.
     """
-    residuals = StereoResiduals.of(T_target_source, matches, camera, huber=huber)
+    residuals = StereoResiduals.of(T_reference_current, matches, camera, huber=huber)
     # Unobservable directions may give steps that are not finite; they are checked.
     with np.errstate(over="ignore", invalid="ignore"):
         rough = _gauss_newton(
-            T_target_source, residuals.select(inliers), n_iterations=_N_FIRST_ITERATIONS
+            T_reference_current, residuals.select(inliers), n_iterations=_N_FIRST_ITERATIONS
         )
         if isinstance(rough, Failure):
             return rough
@@ -149,20 +148,20 @@ def refine_pose(
 
 
 def descend(
-    T_target_source: FloatArray, residuals: StereoResiduals, *, n_iterations: int
+    T_reference_current: FloatArray, residuals: StereoResiduals, *, n_iterations: int
 ) -> FloatArray | None:
     """Minimize the cost of residuals by a few Gauss-Newton steps; None if they fail.
 
     Parameters
     ----------
-    T_target_source : ndarray of float64, shape (4, 4)
+    T_reference_current : ndarray of float64, shape (4, 4)
         Start value.
     residuals : StereoResiduals
     n_iterations : int
         Maximum number.
     """
     with np.errstate(over="ignore", invalid="ignore"):
-        T = _gauss_newton(T_target_source, residuals, n_iterations=n_iterations)
+        T = _gauss_newton(T_reference_current, residuals, n_iterations=n_iterations)
     return None if isinstance(T, Failure) else T
 
 
@@ -172,23 +171,23 @@ class Adjustment:
 
     Parameters
     ----------
-    T_target_source : ndarray of float64, shape (4, 4)
+    T_reference_current : ndarray of float64, shape (4, 4)
     values : ndarray of float64, shape (k,)
         Errors of the constants, in units of what is known of them.
     covariance : ndarray of float64, shape (k, k)
         Of these.
     effects : ndarray of float64, shape (6, k)
-        Derivative of the pose, left perturbation, by what is taken off for each error.
+        Derivative of the pose, right perturbation, by what is taken off for each error.
     """
 
-    T_target_source: FloatArray
+    T_reference_current: FloatArray
     values: FloatArray
     covariance: FloatArray
     effects: FloatArray
 
 
 def adjust(
-    T_target_source: FloatArray,
+    T_reference_current: FloatArray,
     residuals: StereoResiduals,
     *,
     n_iterations: int,
@@ -200,7 +199,7 @@ def adjust(
 
     Parameters
     ----------
-    T_target_source : ndarray of float64, shape (4, 4)
+    T_reference_current : ndarray of float64, shape (4, 4)
         Start value.
     residuals : StereoResiduals
         Of the matches used.
@@ -209,7 +208,7 @@ def adjust(
     sigma_factor : float
         Inflation of the matches' sigmas, relative to what is known of the constants.
     """
-    T = T_target_source
+    T = T_reference_current
     J_constants, _ = residuals.sensitivities(T)
     k, weight = len(J_constants), sigma_factor**2
     values, H = np.zeros(k), np.eye(6 + k)
@@ -227,10 +226,10 @@ def adjust(
             _, step, info = dposv(H, g)
             if info != 0 or not np.isfinite(step).all():
                 return None
-            T = se3.make_transform(cv2.Rodrigues(step[:3])[0], step[3:6]) @ T
+            T = T @ se3.make_transform(cv2.Rodrigues(step[:3])[0], step[3:6])
             values = values + step[6:]
     return Adjustment(
-        T_target_source=se3.normalize(T),
+        T_reference_current=se3.normalize(T),
         values=values,
         covariance=weight * np.asarray(np.linalg.inv(H)[6:, 6:], dtype=np.float64),
         effects=-np.asarray(np.linalg.solve(H[:6, :6], H[:6, 6:]), dtype=np.float64),
@@ -238,7 +237,7 @@ def adjust(
 
 
 def fit_covariance(
-    T_target_source: FloatArray,
+    T_reference_current: FloatArray,
     matches: Correspondences,
     inliers: BoolArray,
     camera: StereoCamera,
@@ -249,8 +248,8 @@ def fit_covariance(
 
     Parameters and results are those of `refine_pose`; pose and inliers stay as they are.
     """
-    residuals = StereoResiduals.of(T_target_source, matches, camera, huber=huber)
-    return _with_covariance(T_target_source, residuals.select(inliers), (inliers, residuals))
+    residuals = StereoResiduals.of(T_reference_current, matches, camera, huber=huber)
+    return _with_covariance(T_reference_current, residuals.select(inliers), (inliers, residuals))
 
 
 def _gauss_newton(
@@ -266,7 +265,7 @@ def _gauss_newton(
         if info != 0 or not np.isfinite(step).all():
             return Failure(reason=_OPEN)
         # Not the exponential map but a retraction: the same to first order, and cheap.
-        T = se3.make_transform(cv2.Rodrigues(step[:3])[0], step[3:]) @ T
+        T = T @ se3.make_transform(cv2.Rodrigues(step[:3])[0], step[3:])
         if step @ at.g < _CONVERGED:
             break
     return T
@@ -288,7 +287,7 @@ def _with_covariance(
     sensitivity = _sensitivity(last, scores, H_inverse, residuals.huber)
     covariance = sensitivity @ _spread(last, scores, scale) @ sensitivity.T
     return Refinement(
-        T_target_source=T,
+        T_reference_current=T,
         covariance=0.5 * (covariance + covariance.T),
         inliers=inliers[0],
         scale=scale,
@@ -328,7 +327,7 @@ def _spread(at: Linearization, scores: FloatArray, scale: float) -> FloatArray:
 
 
 def estimate_constants(
-    T_target_source: FloatArray, residuals: StereoResiduals, at: Linearization
+    T_reference_current: FloatArray, residuals: StereoResiduals, at: Linearization
 ) -> dict[str, ConstantError]:
     """Estimate the errors of constants of the camera, each beside the pose and the others.
 
@@ -338,7 +337,7 @@ def estimate_constants(
 
     Parameters
     ----------
-    T_target_source : ndarray of float64, shape (4, 4)
+    T_reference_current : ndarray of float64, shape (4, 4)
         The refined pose.
     residuals : StereoResiduals
         Of the matches used.
@@ -353,7 +352,7 @@ def estimate_constants(
     """
     if not residuals.constants:
         return {}
-    J_constants, J_alone = residuals.sensitivities(T_target_source)
+    J_constants, J_alone = residuals.sensitivities(T_reference_current)
     for rows in (J_constants, J_alone):
         whiten_in_place(at.factors, rows)
     flat, flat_pose = J_constants.reshape(len(J_constants), -1), at.J.reshape(6, -1)

@@ -1,7 +1,7 @@
 """Whitened stereo reprojection residuals of matches, and their Jacobians.
 
-The residual of a match is its measurement (u, v, disparity) in the target frame less the
-projection of its point in the source frame. Both frames are noisy: the source's covariance is
+The residual of a match is its measurement (u, v, disparity) in the current frame less the
+projection of its point in the reference. Both frames are noisy: the reference's covariance is
 propagated through the motion and added before the residual is whitened.
 
 Arrays hold one match per column: all operations run along contiguous memory.
@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.types import BoolArray, Failure, FloatArray
@@ -27,7 +28,7 @@ _MIN_NOISE_DEPTH_M = 0.1
 
 
 def pose_jacobian(points_cam: FloatArray, camera: StereoCamera) -> FloatArray:
-    """Return the derivatives of (u, v, disparity) of points by their motion.
+    """Return the derivatives of (u, v, disparity) of points by the motion of the camera.
 
     Parameters
     ----------
@@ -38,52 +39,53 @@ def pose_jacobian(points_cam: FloatArray, camera: StereoCamera) -> FloatArray:
     Returns
     -------
     ndarray of float64, shape (6, 3, n)
-        Of (u, v, disparity) by (rx, ry, rz, tx, ty, tz), left perturbation.
+        Of (u, v, disparity) by (rx, ry, rz, tx, ty, tz), right perturbation of the camera's pose:
+        points move the other way.
     """
     inverse_z = 1.0 / points_cam[2]
     x, y = points_cam[:2] * inverse_z
     xy = x * y
     J = np.zeros((6, 3, len(x)))
-    J[0, 0], J[0, 1] = -camera.fx * xy, -camera.fy * (1.0 + y * y)
-    J[1, 0], J[1, 1] = camera.fx * (1.0 + x * x), camera.fy * xy
-    J[2, 0], J[2, 1] = -camera.fx * y, camera.fy * x
-    J[3, 0] = camera.fx * inverse_z
-    J[4, 1] = camera.fy * inverse_z
+    J[0, 0], J[0, 1] = camera.fx * xy, camera.fy * (1.0 + y * y)
+    J[1, 0], J[1, 1] = -camera.fx * (1.0 + x * x), -camera.fy * xy
+    J[2, 0], J[2, 1] = camera.fx * y, -camera.fy * x
+    J[3, 0] = -camera.fx * inverse_z
+    J[4, 1] = -camera.fy * inverse_z
     J[5, 0], J[5, 1] = -x * J[3, 0], -y * J[4, 1]
-    disparities = camera.baseline * J[3, 0]
-    J[0, 2] = -disparities * y
-    J[1, 2] = disparities * x
-    J[5, 2] = -disparities * inverse_z
+    disparities = camera.fx * camera.baseline * inverse_z
+    J[0, 2], J[1, 2] = disparities * y, -disparities * x
+    J[5, 2] = disparities * inverse_z
     return J
 
 
-def source_jacobian(
-    T_target_source: FloatArray, source_points: FloatArray, camera: StereoCamera
+def reference_jacobian(
+    T_reference_current: FloatArray, reference_points: FloatArray, camera: StereoCamera
 ) -> FloatArray:
-    """Return the derivatives of the prediction in the target by the measurement in the source.
+    """Return the derivatives of what is predicted by what the reference measured.
 
     Parameters
     ----------
-    T_target_source : ndarray of float64, shape (4, 4)
-    source_points : ndarray of float64, shape (3, n)
-        Points in the source frame, metres.
+    T_reference_current : ndarray of float64, shape (4, 4)
+    reference_points : ndarray of float64, shape (3, n)
+        Points in the reference, metres.
     camera : StereoCamera
         Of both frames.
 
     Returns
     -------
     ndarray of float64, shape (3, 3, n)
-        Of (u, v, disparity) in the target by (u, v, disparity) in the source. Meaningless, but
-        finite, for points less than 0.1 m in front of the target.
+        Of (u, v, disparity) in the current frame by (u, v, disparity) in the reference.
+        Meaningless, but finite, for points less than 0.1 m in front of the current camera.
     """
-    R, t = T_target_source[:3, :3], T_target_source[:3, 3:]
-    rotated = R @ source_points
+    T_current_reference = se3.invert(T_reference_current)
+    R, t = T_current_reference[:3, :3], T_current_reference[:3, 3:]
+    rotated = R @ reference_points
     points = rotated + t
     points[:, points[2] < _MIN_NOISE_DEPTH_M] = ((0.0,), (0.0,), (1.0,))
     inverse_z = 1.0 / points[2]
     x, y = points[:2] * inverse_z
-    depths = source_points[2]
-    moved = np.empty((3, 3, len(depths)))  # the point's motion in the target frame
+    depths = reference_points[2]
+    moved = np.empty((3, 3, len(depths)))  # the point's motion in the current frame
     moved[0] = R[:, :1] * (depths / camera.fx)
     moved[1] = R[:, 1:2] * (depths / camera.fy)
     moved[2] = rotated * (depths / (-camera.fx * camera.baseline))
@@ -130,10 +132,10 @@ class StereoResiduals:
     Parameters
     ----------
     columns : ndarray of float64, shape (15 + 6 k, n)
-        Points in the source frame, (u, v, disparity) in the target frame, the lower triangle
+        Points in the reference, (u, v, disparity) in the current frame, the lower triangle
         (00, 10, 11, 20, 21, 22) of the factor W with W^T W the inverse covariance of the
-        residual, the variances of (u, v, disparity) in the source frame, and the derivatives of
-        (u, v, disparity) in source and target by each constant.
+        residual, the variances of (u, v, disparity) in the reference, and the derivatives of
+        (u, v, disparity) in reference and current frame by each constant.
     camera : StereoCamera
     huber : float
         Threshold of the robust kernel, sigmas.
@@ -156,21 +158,21 @@ class StereoResiduals:
         """
         constants = tuple(matches.sensitivities)
         columns = np.empty((_N_ROWS + 6 * len(constants), len(matches)))
-        columns[:3] = matches.source_points.T
-        columns[3:6] = matches.target_uvd.T
-        columns[12:_N_ROWS] = matches.source_sigmas.T**2
+        columns[:3] = matches.reference_points.T
+        columns[3:6] = matches.current_uvd.T
+        columns[12:_N_ROWS] = matches.reference_sigmas.T**2
         for rows, name in zip(
             columns[_N_ROWS:].reshape(len(constants), 6, len(matches)), constants, strict=True
         ):
             rows[:3], rows[3:] = np.swapaxes(matches.sensitivities[name], 1, 2)
-        J = source_jacobian(T, columns[:3], camera)
-        J *= matches.source_sigmas.T[:, np.newaxis]
-        _write_factors(columns[6:12], J, matches.target_sigmas.T**2)
+        J = reference_jacobian(T, columns[:3], camera)
+        J *= matches.reference_sigmas.T[:, np.newaxis]
+        _write_factors(columns[6:12], J, matches.current_sigmas.T**2)
         return cls(columns=columns, camera=camera, huber=huber, constants=constants)
 
     @property
-    def source_points(self) -> FloatArray:
-        """Points in the source frame, shape (3, n), metres."""
+    def reference_points(self) -> FloatArray:
+        """Points in the reference, shape (3, n), metres."""
         return self.columns[:3]
 
     def select(self, chosen: BoolArray) -> StereoResiduals:
@@ -178,7 +180,7 @@ class StereoResiduals:
         return replace(self, columns=self.columns.take(np.flatnonzero(chosen), axis=1))
 
     def without(self, errors: FloatArray) -> StereoResiduals:
-        """Return the residuals after measurements in the target were corrected, shape (3, n)."""
+        """Return the residuals after current measurements were corrected, shape (3, n)."""
         columns = self.columns.copy()
         columns[3:6] -= errors
         return replace(self, columns=columns)
@@ -189,21 +191,21 @@ class StereoResiduals:
         Parameters
         ----------
         T : ndarray of float64, shape (4, 4)
-            T_target_source.
+            T_reference_current.
 
         Returns
         -------
         of_residuals : ndarray of float64, shape (k, 3, n)
-        of_target : ndarray of float64, shape (k, 3, n)
-            The part of the measurements in the target.
+        of_current : ndarray of float64, shape (k, 3, n)
+            The part of the measurements in the current frame.
         """
         n = self.columns.shape[1]
-        in_source, in_target = np.swapaxes(
+        in_reference, in_current = np.swapaxes(
             self.columns[_N_ROWS:].reshape(len(self.constants), 2, 3, n), 0, 1
         )
-        J = source_jacobian(T, self.source_points, self.camera)
-        # An error moves the measurement in the target directly, the prediction through the source.
-        return in_target - np.einsum("jin,kjn->kin", J, in_source), in_target.copy()
+        J = reference_jacobian(T, self.reference_points, self.camera)
+        # An error moves the current measurement directly, the prediction through the reference.
+        return in_current - np.einsum("jin,kjn->kin", J, in_reference), in_current.copy()
 
     def linearize(self, T: FloatArray) -> Linearization | Failure:
         """Linearize at T; a failure if points fall behind the camera.
@@ -211,7 +213,7 @@ class StereoResiduals:
         Parameters
         ----------
         T : ndarray of float64, shape (4, 4)
-            T_target_source.
+            T_reference_current.
         """
         points = self._moved(T)
         if isinstance(points, Failure):
@@ -230,15 +232,15 @@ class StereoResiduals:
 
     def squared(self, T: FloatArray) -> FloatArray:
         """Return the squared lengths of the residuals, in sigmas; infinite behind the camera."""
-        points = T[:3, :3] @ self.columns[:3] + T[:3, 3:]
+        points = T[:3, :3].T @ (self.columns[:3] - T[:3, 3:])
         is_in_front = points[2] > _MIN_DEPTH_M
         points[2, ~is_in_front] = 1.0
         _, squared = self._whitened(points)
         return np.where(is_in_front, squared, np.inf)
 
     def _moved(self, T: FloatArray) -> FloatArray | Failure:
-        """Return the points in the target frame, shape (3, n)."""
-        points = T[:3, :3] @ self.columns[:3] + T[:3, 3:]
+        """Return the points in the current frame, shape (3, n)."""
+        points = T[:3, :3].T @ (self.columns[:3] - T[:3, 3:])
         if np.any(points[2] < _MIN_DEPTH_M):
             return Failure(reason="the motion puts points behind the camera")
         return points
@@ -271,13 +273,13 @@ def whiten_in_place(factors: FloatArray, rows: FloatArray) -> None:
     u *= factors[0]
 
 
-def _write_factors(out: FloatArray, J: FloatArray, target_variances: FloatArray) -> None:
-    """Write the inverse Cholesky factors of J^T J + diag(target_variances), shape (6, n).
+def _write_factors(out: FloatArray, J: FloatArray, current_variances: FloatArray) -> None:
+    """Write the inverse Cholesky factors of J^T J + diag(current_variances), shape (6, n).
 
-    The squared pivots are no less than the target's variances, but for rounding.
+    The squared pivots are no less than the current variances, but for rounding.
     """
     covariance = np.einsum("kin,kjn->ijn", J, J)
-    var_u, var_v, var_d = target_variances
+    var_u, var_v, var_d = current_variances
     out[0] = 1.0 / np.sqrt(covariance[0, 0] + var_u)
     l_vu, l_du = covariance[1:, 0] * out[0]
     out[2] = 1.0 / np.sqrt(np.maximum(covariance[1, 1] + var_v - l_vu**2, var_v))

@@ -24,54 +24,50 @@ _MIN_SPREAD_RATIO = 1e-13
 
 
 def fit_rigid_batch(
-    source_points: FloatArray, target_points: FloatArray, *, weights: FloatArray | None = None
+    points_a: FloatArray, points_b: FloatArray, *, weights: FloatArray | None = None
 ) -> tuple[FloatArray, BoolArray]:
     """Fit one rigid transform to each of many sets of corresponding points.
 
     Parameters
     ----------
-    source_points, target_points : ndarray of float64, shape (..., n, 3)
+    points_a, points_b : ndarray of float64, shape (..., n, 3)
         Corresponding points in two frames, metres.
     weights : ndarray of float64, shape (..., n), optional
         Not negative; equal weights where omitted.
 
     Returns
     -------
-    T_target_source : ndarray of float64, shape (..., 4, 4)
+    T_a_b : ndarray of float64, shape (..., 4, 4)
         Minimizes the weighted sum of squared distances; never a reflection. Invalid fits have
         the identity rotation.
     is_valid : ndarray of bool, shape (...)
         False for fewer than three points with weight, for points on a line, for NaN.
     """
-    if source_points.shape != target_points.shape or source_points.shape[-1] != 3:
-        raise ValueError(
-            f"expected two arrays (..., n, 3), got {source_points.shape}, {target_points.shape}"
-        )
-    if source_points.shape[-2] < 3:
-        T = np.broadcast_to(np.eye(4), (*source_points.shape[:-2], 4, 4)).copy()
-        return T, np.zeros(source_points.shape[:-2], dtype=np.bool_)
-    w = _normalized_weights(source_points, weights)
-    source_mean = np.sum(w * source_points, axis=-2, keepdims=True)
-    target_mean = np.sum(w * target_points, axis=-2, keepdims=True)
-    source_centred = source_points - source_mean
+    if points_b.shape != points_a.shape or points_b.shape[-1] != 3:
+        raise ValueError(f"expected two arrays (..., n, 3), got {points_a.shape}, {points_b.shape}")
+    if points_b.shape[-2] < 3:
+        T = np.broadcast_to(np.eye(4), (*points_b.shape[:-2], 4, 4)).copy()
+        return T, np.zeros(points_b.shape[:-2], dtype=np.bool_)
+    w = _normalized_weights(points_b, weights)
+    mean_b = np.sum(w * points_b, axis=-2, keepdims=True)
+    mean_a = np.sum(w * points_a, axis=-2, keepdims=True)
+    centred_b = points_b - mean_b
     # eq. 38: cross-covariance of the two sets
-    cross = np.swapaxes(w * (target_points - target_mean), -1, -2) @ source_centred
+    cross = np.swapaxes(w * (points_a - mean_a), -1, -2) @ centred_b
     is_finite = np.isfinite(cross).all(axis=(-1, -2))
     U, singular_values, Vt = np.linalg.svd(np.where(is_finite[..., None, None], cross, 0.0))
-    extent = np.abs(source_points).max(axis=(-1, -2)) * np.abs(target_points).max(axis=(-1, -2))
+    extent = np.abs(points_b).max(axis=(-1, -2)) * np.abs(points_a).max(axis=(-1, -2))
     is_valid = is_finite & (singular_values[..., 0] > _MIN_SPREAD_RATIO * extent)
     is_valid &= singular_values[..., 1] > _MIN_VARIANCE_RATIO * singular_values[..., 0]
     signs = np.ones_like(singular_values)
     signs[..., 2] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))  # eq. 39: no reflection
     R = (U * signs[..., np.newaxis, :]) @ Vt  # eq. 40
     R = np.where(is_valid[..., None, None], R, np.eye(3))
-    t = (target_mean - source_mean @ np.swapaxes(R, -1, -2))[..., 0, :]  # eq. 41
+    t = (mean_a - mean_b @ np.swapaxes(R, -1, -2))[..., 0, :]  # eq. 41
     return make_transform(R, t), is_valid
 
 
-def fit_rigid_triples(
-    source_points: FloatArray, target_points: FloatArray
-) -> tuple[FloatArray, BoolArray]:
+def fit_rigid_triples(points_a: FloatArray, points_b: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Fit one rigid transform to each of many triples of corresponding points.
 
     As `fit_rigid_batch` in a fraction of its time: the best rotation maps one triangle's plane to
@@ -79,21 +75,21 @@ def fit_rigid_triples(
 
     Parameters
     ----------
-    source_points, target_points : ndarray of float64, shape (m, 3, 3)
+    points_a, points_b : ndarray of float64, shape (m, 3, 3)
         Triples of corresponding points in two frames, metres.
 
     Returns
     -------
-    T_target_source : ndarray of float64, shape (m, 4, 4)
+    T_a_b : ndarray of float64, shape (m, 4, 4)
         Minimizes the sum of squared distances. Invalid fits have the identity rotation.
     is_valid : ndarray of bool, shape (m,)
         False for points on a line, for NaN.
     """
     # Vertices, coordinates, frames, triples: both frames in one go.
-    points = np.stack([source_points, target_points]).transpose(2, 3, 0, 1)
+    points = np.stack([points_b, points_a]).transpose(2, 3, 0, 1)
     with np.errstate(invalid="ignore", divide="ignore"):
         axes, a, b = _in_plane(points)
-        # Sum of conj(source) * target over the vertices, measured from the centres.
+        # Sum over the vertices, from the centres: frame a's times the conjugates of frame b's.
         turn = a[0] * a[1] + np.conj(b[0]) * b[1]
         turn -= np.conj(a[0] + b[0]) * (a[1] + b[1]) / 3.0
         # Sum and product of the two singular values of the cross-covariance, times 3 and 9.
@@ -107,18 +103,18 @@ def fit_rigid_triples(
         turned[1] = turn.real * axes[1, :, 1] - turn.imag * axes[0, :, 1]
         R = np.einsum("aim,ajm->mij", turned, axes[:, :, 0])
     R = np.where(is_valid[:, np.newaxis, np.newaxis], R, np.eye(3))
-    source_mean, target_mean = points.mean(axis=0).transpose(1, 2, 0)
-    return make_transform(R, target_mean - np.einsum("mij,mj->mi", R, source_mean)), is_valid
+    mean_b, mean_a = points.mean(axis=0).transpose(1, 2, 0)
+    return make_transform(R, mean_a - np.einsum("mij,mj->mi", R, mean_b)), is_valid
 
 
 def fit_rigid(
-    source_points: FloatArray, target_points: FloatArray, *, weights: FloatArray | None = None
+    points_a: FloatArray, points_b: FloatArray, *, weights: FloatArray | None = None
 ) -> FloatArray | Failure:
     """Fit the rigid transform between two sets of corresponding points.
 
     Parameters
     ----------
-    source_points, target_points : ndarray of float64, shape (n, 3)
+    points_a, points_b : ndarray of float64, shape (n, 3)
         Corresponding points in two frames, metres.
     weights : ndarray of float64, shape (n,), optional
         Not negative; equal weights where omitted.
@@ -126,19 +122,19 @@ def fit_rigid(
     Returns
     -------
     ndarray of float64, shape (4, 4), or Failure
-        T_target_source; a failure for fewer than three points or points on a line.
+        T_a_b; a failure for fewer than three points or points on a line.
 
     Examples
     --------
     >>> points = np.eye(3)
-    >>> T = fit_rigid(points, points + [1.0, 2.0, 3.0])
+    >>> T = fit_rigid(points + [1.0, 2.0, 3.0], points)
     >>> T[:3, 3].round(6).tolist()
     [1.0, 2.0, 3.0]
     """
-    n = len(source_points)
+    n = len(points_b)
     if n < 3:
         return Failure(reason=f"a rigid fit needs three points, got {n}", n_matches=n)
-    T, is_valid = fit_rigid_batch(source_points, target_points, weights=weights)
+    T, is_valid = fit_rigid_batch(points_a, points_b, weights=weights)
     if not is_valid:
         return Failure(reason=f"{n} points lie on a line", n_matches=n)
     return T

@@ -245,7 +245,7 @@ def test_a_rough_estimate_is_near_and_starts_the_next_without_samples(is_predict
     assert isinstance(found, RelativePose)
     assert not isinstance(rough, Failure)
     # Not as good: its inliers are those of the prediction or of a sample.
-    difference = se3.log(rough @ found.T_reference_current)
+    difference = se3.log(np.linalg.inv(found.T_reference_current) @ rough)
     assert difference @ np.linalg.solve(found.covariance, difference) / 6 < 5.0
     assert np.linalg.norm(difference) < 0.5 * np.linalg.norm(se3.log(np.linalg.inv(T) @ start))
     with pytest.MonkeyPatch.context() as patch:
@@ -282,9 +282,9 @@ def test_rows_that_are_bent_are_inliers_of_a_rough_estimate_only(
 ) -> None:
     T, reference, current, matches = two_frames(7, n_outliers=0, noise=0.0)
     given = Correspondences.of(reference, current, matches)
-    bent = given.target_uvd + [[5.0, 0.0, 0.0]] * np.sign(given.target_uvd[:, 1:2] - CAMERA.cy)
+    bent = given.current_uvd + [[5.0, 0.0, 0.0]] * np.sign(given.current_uvd[:, 1:2] - CAMERA.cy)
     given = Correspondences.of_pixels(
-        (given.source_uvd, bent), (given.source_sigmas, given.target_sigmas), CAMERA
+        (given.reference_uvd, bent), (given.reference_sigmas, given.current_sigmas), CAMERA
     )
     forbid_search(monkeypatch)
     prior = MotionPrior(T_predicted=T)

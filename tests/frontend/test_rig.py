@@ -364,7 +364,7 @@ def test_a_pose_is_off_by_what_is_learnt_of_its_velocity_later() -> None:
             values=np.arange(6.0),
             covariance=np.eye(6),
             effects=rng.normal(size=(6, 6)),
-            T_target_source=np.eye(4),
+            T_reference_current=np.eye(4),
         ),
     )
     np.testing.assert_array_equal(measured.velocity, extrapolated + sigmas * np.arange(6))
@@ -379,7 +379,7 @@ def test_a_pose_is_off_by_what_is_learnt_of_its_velocity_later() -> None:
     assert_velocity(third, mean)
     assert third.motion.measured is None
     change = (mean - measured.velocity) / sigmas
-    np.testing.assert_allclose(third.motion.error(), -measured.found.effects @ change)
+    np.testing.assert_allclose(third.motion.error(), measured.found.effects @ change)
     # Where the next step fails, what was measured is the best that is known.
     note_step(third, fourth, None)
     assert_velocity(third, measured.velocity)

@@ -41,6 +41,11 @@ def move(T: FloatArray, points: FloatArray) -> FloatArray:
     return np.asarray(points @ T[:3, :3].T + T[:3, 3])
 
 
+def seen_from(T_reference_current: FloatArray, points: FloatArray) -> FloatArray:
+    """Return points of the reference as the current camera has them."""
+    return np.asarray((points - T_reference_current[:3, 3]) @ T_reference_current[:3, :3])
+
+
 def random_motion(
     rng: np.random.Generator, turn_rad: float = 0.1, shift_m: float = 0.2
 ) -> FloatArray:
@@ -60,22 +65,24 @@ def near_a_line(spread_m: float) -> FloatArray:
 
 
 def matched(
-    source: FloatArray,
-    target: FloatArray,
+    reference: FloatArray,
+    current: FloatArray,
     *,
-    source_uvd: FloatArray | None = None,
-    target_uvd: FloatArray | None = None,
-    source_sigmas: ArrayLike = 1.0,
-    target_sigmas: ArrayLike = 1.0,
+    reference_uvd: FloatArray | None = None,
+    current_uvd: FloatArray | None = None,
+    reference_sigmas: ArrayLike = 1.0,
+    current_sigmas: ArrayLike = 1.0,
 ) -> Correspondences:
     """Return correspondences of points (n, 3), measured where they are projected by default."""
     return Correspondences(
-        source_points=source,
-        target_points=target,
-        source_uvd=project(source) if source_uvd is None else source_uvd,
-        target_uvd=project(target) if target_uvd is None else target_uvd,
-        source_sigmas=np.broadcast_to(np.asarray(source_sigmas, dtype=float), source.shape),
-        target_sigmas=np.broadcast_to(np.asarray(target_sigmas, dtype=float), source.shape),
+        reference_points=reference,
+        current_points=current,
+        reference_uvd=project(reference) if reference_uvd is None else reference_uvd,
+        current_uvd=project(current) if current_uvd is None else current_uvd,
+        reference_sigmas=np.broadcast_to(
+            np.asarray(reference_sigmas, dtype=float), reference.shape
+        ),
+        current_sigmas=np.broadcast_to(np.asarray(current_sigmas, dtype=float), reference.shape),
     )
 
 

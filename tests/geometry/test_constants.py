@@ -16,9 +16,9 @@ from tests.geometry.scenes import (
     all_of,
     derivative,
     matched,
-    move,
     project,
     random_motion,
+    seen_from,
     unproject,
 )
 
@@ -28,30 +28,30 @@ SIGMA = 0.2
 
 
 def drive(seed: int, offset_px: float, *, noise: float = 1.0) -> tuple[FloatArray, Correspondences]:
-    """Return T_target_source and matches, the disparities of both frames too large."""
+    """Return T_reference_current and matches, the disparities of both frames too large."""
     rng = np.random.default_rng(seed)
     T = random_motion(rng, 0.01)
-    T[:3, 3] = [0.02, 0.01, -1.0]
+    T[:3, 3] = [-0.02, -0.01, 1.0]
     disparities = 350 * rng.uniform(1 / 50, 1 / 5, 400)
     pixels = rng.uniform([100, 40], [1100, 330], size=(400, 2))
-    source = unproject(np.column_stack([pixels, disparities]), CAMERA)
+    reference = unproject(np.column_stack([pixels, disparities]), CAMERA)
     first, second = [
         project(points, CAMERA) + noise * SIGMA * rng.normal(size=(400, 3)) + [0.0, 0.0, offset_px]
-        for points in (source, move(T, source))
+        for points in (reference, seen_from(T, reference))
     ]
     return T, measured(first, second, {"offset": np.tile([0.0, 0.0, 1.0], (2, 400, 1))})
 
 
 def measured(
-    source_uvd: FloatArray, target_uvd: FloatArray, sensitivities: dict[str, FloatArray]
+    reference_uvd: FloatArray, current_uvd: FloatArray, sensitivities: dict[str, FloatArray]
 ) -> Correspondences:
-    points = [unproject(uvd, CAMERA) for uvd in (source_uvd, target_uvd)]
+    points = [unproject(uvd, CAMERA) for uvd in (reference_uvd, current_uvd)]
     matches = matched(
         *points,
-        source_uvd=source_uvd,
-        target_uvd=target_uvd,
-        source_sigmas=SIGMA,
-        target_sigmas=SIGMA,
+        reference_uvd=reference_uvd,
+        current_uvd=current_uvd,
+        reference_sigmas=SIGMA,
+        current_sigmas=SIGMA,
     )
     return replace(matches, sensitivities=sensitivities)
 
@@ -104,9 +104,9 @@ def test_the_estimate_is_that_of_least_squares_over_pose_and_offset() -> None:
     T, matches = drive(3, 0.2, noise=0.01)
 
     def residuals(x: FloatArray) -> FloatArray:
-        source = unproject(matches.source_uvd - [0.0, 0.0, x[6]], CAMERA)
-        moved = source @ Rotation.from_rotvec(x[:3]).as_matrix().T + x[3:6]
-        return np.asarray((matches.target_uvd - [0.0, 0.0, x[6]] - project(moved, CAMERA)).ravel())
+        reference = unproject(matches.reference_uvd - [0.0, 0.0, x[6]], CAMERA)
+        moved = (reference - x[3:6]) @ Rotation.from_rotvec(x[:3]).as_matrix()
+        return np.asarray((matches.current_uvd - [0.0, 0.0, x[6]] - project(moved, CAMERA)).ravel())
 
     start = np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3], [0.0]])
     optimum = least_squares(residuals, start, xtol=1e-12, ftol=1e-12, gtol=1e-12)
@@ -123,12 +123,12 @@ def row_by_row(
         [
             (uvd[:, 1:2] / CAMERA.height - 0.5) * velocity_px
             for uvd, velocity_px in (
-                (matches.source_uvd, [12.0, 5.0, 0.0]),
-                (matches.target_uvd, [-3.0, 9.0, 0.0]),
+                (matches.reference_uvd, [12.0, 5.0, 0.0]),
+                (matches.current_uvd, [-3.0, 9.0, 0.0]),
             )
         ]
     )
-    uvds = matches.source_uvd + readout * shifts[0], matches.target_uvd + readout * shifts[1]
+    uvds = matches.reference_uvd + readout * shifts[0], matches.current_uvd + readout * shifts[1]
     return T, measured(*uvds, {**matches.sensitivities, "readout": shifts})
 
 
@@ -139,9 +139,9 @@ def test_constants_are_those_of_least_squares_over_pose_and_all_of_them() -> Non
     def residuals(x: FloatArray) -> FloatArray:
         uvds = [
             uvd - [0.0, 0.0, x[6]] - x[7] * shift
-            for uvd, shift in zip((matches.source_uvd, matches.target_uvd), shifts, strict=True)
+            for uvd, shift in zip((matches.reference_uvd, matches.current_uvd), shifts, strict=True)
         ]
-        moved = unproject(uvds[0], CAMERA) @ Rotation.from_rotvec(x[:3]).as_matrix().T + x[3:6]
+        moved = (unproject(uvds[0], CAMERA) - x[3:6]) @ Rotation.from_rotvec(x[:3]).as_matrix()
         return np.asarray((uvds[1] - project(moved, CAMERA)).ravel())
 
     start = np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3], [0.0, 0.0]])
@@ -178,49 +178,51 @@ def test_the_pose_is_the_same_with_and_without_the_estimate() -> None:
     T, matches = drive(1, 0.2)
     with_it, without = refine(T, matches), refine(T, replace(matches, sensitivities={}))
     assert without.calibration_errors == {}
-    np.testing.assert_array_equal(with_it.T_target_source, without.T_target_source)
+    np.testing.assert_array_equal(with_it.T_reference_current, without.T_reference_current)
     np.testing.assert_array_equal(with_it.covariance, without.covariance)
 
 
 def test_a_camera_at_rest_says_nothing_of_the_offset() -> None:
     # Both frames are wrong alike: the residuals are those of a rig without offset.
     _, matches = drive(2, 0.3, noise=0.0)
-    same = replace(matches, target_points=matches.source_points, target_uvd=matches.source_uvd)
+    same = replace(
+        matches, current_points=matches.reference_points, current_uvd=matches.reference_uvd
+    )
     assert refine(np.eye(4), same).calibration_errors == {}
 
 
 def information_share(T: FloatArray, matches: Correspondences) -> float:
-    """Return what is known of the offset beside the pose, over what target disparities tell.
+    """Return what is known of the offset beside the pose, over what current disparities tell.
 
     By QR of the derivatives, the offset's behind those of the pose.
     """
     rows = []
-    for source, sigmas in zip(matches.source_points, matches.target_sigmas, strict=True):
-        J = derivative(move(T, source), CAMERA)
+    for reference, sigmas in zip(matches.reference_points, matches.current_sigmas, strict=True):
+        J = derivative(seen_from(T, reference), CAMERA)
         # A larger disparity draws a point along its ray.
-        by_offset = [0, 0, 1] + J[:, 3:] @ T[:3, :3] @ source * source[2] / 350
+        by_offset = [0, 0, 1] + J[:, 3:] @ T[:3, :3].T @ reference * reference[2] / 350
         J = np.column_stack([J, by_offset])
         rows.append(J / sigmas[:, np.newaxis])
     R = np.linalg.qr(np.concatenate(rows))[1]
-    return float(R[6, 6] ** 2 / np.sum(1.0 / matches.target_sigmas[:, 2] ** 2))
+    return float(R[6, 6] ** 2 / np.sum(1.0 / matches.current_sigmas[:, 2] ** 2))
 
 
 def barely_moved(step_m: float) -> tuple[FloatArray, Correspondences]:
     rng = np.random.default_rng(3)
     pixels = rng.uniform([100, 40], [1100, 330], size=(200, 2))
-    source_uvd = np.column_stack([pixels, rng.uniform(7.0, 70.0, 200)])
+    reference_uvd = np.column_stack([pixels, rng.uniform(7.0, 70.0, 200)])
     T = np.eye(4)
-    T[2, 3] = -step_m
-    source = unproject(source_uvd, CAMERA)
-    target = move(T, source)
-    target_uvd = project(target, CAMERA)
+    T[2, 3] = step_m
+    reference = unproject(reference_uvd, CAMERA)
+    current = seen_from(T, reference)
+    current_uvd = project(current, CAMERA)
     matches = matched(
-        source,
-        target,
-        source_uvd=source_uvd,
-        target_uvd=target_uvd,
-        source_sigmas=0.0,
-        target_sigmas=[0.4, 0.3, 0.2],
+        reference,
+        current,
+        reference_uvd=reference_uvd,
+        current_uvd=current_uvd,
+        reference_sigmas=0.0,
+        current_sigmas=[0.4, 0.3, 0.2],
     )
     return T, replace(matches, sensitivities={"offset": np.tile([0.0, 0.0, 1.0], (2, 200, 1))})
 
@@ -236,7 +238,7 @@ def test_a_motion_too_small_to_tell_an_offset_tells_nothing(share: float, is_tol
 
 def test_the_sigma_of_the_offset_is_that_of_the_scores_that_the_matches_show() -> None:
     T, matches = drive(4, 0.0)
-    matches = replace(matches, source_sigmas=np.full((400, 3), 1e-12))
+    matches = replace(matches, reference_sigmas=np.full((400, 3), 1e-12))
     residuals, at = linearized(T, matches)
     found = estimate_constants(T, residuals, at)["offset"]
     information = information_share(T, matches) * 400 / SIGMA**2

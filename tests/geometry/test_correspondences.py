@@ -28,7 +28,7 @@ def test_pixels_of_both_frames_become_points_of_their_own_frames(seed: int) -> N
     sigmas = rng.uniform(0.1, 1.0, (7, 3)), rng.uniform(0.1, 1.0, (7, 3))
     matches = Correspondences.of_pixels(pixels, sigmas, CAMERA)
     assert len(matches) == 7
-    for index, side in enumerate(("source", "target")):
+    for index, side in enumerate(("reference", "current")):
         points = getattr(matches, f"{side}_points")
         np.testing.assert_allclose(points, unproject(pixels[index]), rtol=1e-12)
         np.testing.assert_array_equal(getattr(matches, f"{side}_uvd"), pixels[index])
@@ -40,11 +40,11 @@ def test_an_offset_that_is_taken_off_was_in_both_disparities(seed: int) -> None:
     true = random_correspondences(np.random.default_rng(seed), 7)
     offset = np.array([0.0, 0.0, 0.4])
     measured = Correspondences.of_pixels(
-        (true.source_uvd + offset, true.target_uvd + offset),
-        (true.source_sigmas, true.target_sigmas),
+        (true.reference_uvd + offset, true.current_uvd + offset),
+        (true.reference_sigmas, true.current_sigmas),
         CAMERA,
     )
-    assert not np.allclose(measured.source_points, true.source_points, rtol=1e-3)
+    assert not np.allclose(measured.reference_points, true.reference_points, rtol=1e-3)
     for name in {field.name for field in fields(Correspondences)} - {"sensitivities", "expected"}:
         found = getattr(measured.without_offset(0.4, CAMERA), name)
         np.testing.assert_allclose(found, getattr(true, name), rtol=1e-9)
@@ -71,7 +71,7 @@ def test_matches_pair_what_each_frame_saw() -> None:
     for found, expected in ((matches, pairs), (chosen, [pairs[2], pairs[0]])):
         assert len(found) == len(expected)
         for row, (i, j) in enumerate(expected):
-            for frame, index, side in zip(frames, (i, j), ("source", "target"), strict=True):
+            for frame, index, side in zip(frames, (i, j), ("reference", "current"), strict=True):
                 point, uvd = getattr(found, f"{side}_points"), getattr(found, f"{side}_uvd")
                 np.testing.assert_array_equal(point[row], frame.points_cam[index])
                 np.testing.assert_array_equal(uvd[row, :2], frame.keypoints[index])

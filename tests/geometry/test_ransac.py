@@ -16,7 +16,7 @@ from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.ransac import Consensus, draw_samples, find_inliers, ransac_rigid
 from gvo.geometry.umeyama import fit_rigid_triples
 from gvo.types import BoolArray, Failure, FloatArray
-from tests.geometry.scenes import CAMERA, matched, move, project, random_motion, seeds
+from tests.geometry.scenes import CAMERA, matched, project, random_motion, seeds, seen_from
 
 SETTINGS = RansacConfig(
     n_hypotheses=200,
@@ -39,19 +39,19 @@ def random_points(rng: np.random.Generator, n: int) -> FloatArray:
 def scene(
     rng: np.random.Generator, n: int, n_outliers: int
 ) -> tuple[FloatArray, Correspondences, BoolArray]:
-    """Return T_target_source, correspondences and which obey it: the others miss it by far."""
+    """Return T_reference_current, correspondences and which obey it: the others miss it by far."""
     T = random_motion(rng)
-    source = random_points(rng, n)
-    target = move(T, source)
+    reference = random_points(rng, n)
+    current = seen_from(T, reference)
     is_inlier = rng.permutation(n) >= n_outliers
     wrong = np.stack([random_points(rng, n_outliers) for _ in range(9)])
     missed_px = np.linalg.norm(
-        project(wrong.reshape(-1, 3)).reshape(wrong.shape) - project(target[~is_inlier]), axis=2
+        project(wrong.reshape(-1, 3)).reshape(wrong.shape) - project(current[~is_inlier]), axis=2
     )
-    is_far = (missed_px > 10.0) & (np.linalg.norm(wrong - target[~is_inlier], axis=2) > 0.5)
+    is_far = (missed_px > 10.0) & (np.linalg.norm(wrong - current[~is_inlier], axis=2) > 0.5)
     assert is_far.any(axis=0).all()
-    target[~is_inlier] = wrong[is_far.argmax(axis=0), np.arange(n_outliers)]
-    return T, matched(source, target), is_inlier
+    current[~is_inlier] = wrong[is_far.argmax(axis=0), np.arange(n_outliers)]
+    return T, matched(reference, current), is_inlier
 
 
 def run(matches: Correspondences, config: RansacConfig, seed: int = 0) -> Consensus | Failure:
@@ -64,7 +64,7 @@ def test_the_motion_is_found_among_six_outliers_in_ten(seed: int, metric: str) -
     T, matches, is_inlier = scene(np.random.default_rng(seed), 150, 90)
     result = run(matches, configure(inlier_metric=metric))
     assert isinstance(result, Consensus)
-    np.testing.assert_allclose(result.T_target_source, T, atol=0.025)
+    np.testing.assert_allclose(result.T_reference_current, T, atol=0.025)
     assert result.inliers[is_inlier].mean() > 0.95
     assert result.inliers[~is_inlier].mean() < 0.05
 
@@ -75,7 +75,7 @@ def test_the_same_seed_gives_the_same_result(seed: int) -> None:
     first, second = run(matches, SETTINGS, seed), run(matches, SETTINGS, seed)
     assert isinstance(first, Consensus)
     assert isinstance(second, Consensus)
-    assert first.T_target_source.tobytes() == second.T_target_source.tobytes()
+    assert first.T_reference_current.tobytes() == second.T_reference_current.tobytes()
     assert first.inliers.tobytes() == second.inliers.tobytes()
 
 
@@ -89,11 +89,11 @@ def test_inliers_are_those_within_the_threshold_of_the_metric(seed: int, metric:
     assert found.shape == (4, 40)
     for i, T in enumerate(hypotheses):
         for j in range(40):
-            point = T[:3, :3] @ matches.source_points[j] + T[:3, 3]
+            point = seen_from(T, matches.reference_points[j])
             if metric == "distance":
-                ratio = np.linalg.norm(point - matches.target_points[j]) / 0.4
+                ratio = np.linalg.norm(point - matches.current_points[j]) / 0.4
             else:
-                ratio = np.linalg.norm(project(point[None])[0] - matches.target_uvd[j]) / 30.0
+                ratio = np.linalg.norm(project(point[None])[0] - matches.current_uvd[j]) / 30.0
             if abs(ratio - 1.0) > 1e-4:  # single precision decides nearer than this
                 assert found[i, j] == (ratio < 1.0)
 
@@ -111,7 +111,7 @@ def test_points_behind_the_camera_are_no_inliers() -> None:
     ):
         found = find_inliers(
             np.eye(4)[None],
-            matched(there, there, source_uvd=measured, target_uvd=measured),
+            matched(there, there, reference_uvd=measured, current_uvd=measured),
             CAMERA,
             SETTINGS,
         )
@@ -123,14 +123,14 @@ def test_samples_are_drawn_of_near_points() -> None:
     rng = np.random.default_rng(7)
     T, matches, _ = scene(rng, 160, 0)
     is_near = np.arange(160) < 20
-    spoilt = matches.target_points.copy()
+    spoilt = matches.current_points.copy()
     spoilt[~is_near] = random_points(rng, 140)
-    measured = matches.source_uvd.copy()
+    measured = matches.reference_uvd.copy()
     measured[:, 2] = np.where(is_near, 40.0, 5.0)
-    far = replace(matches, target_points=spoilt, source_uvd=measured)
+    far = replace(matches, current_points=spoilt, reference_uvd=measured)
     result = run(far, configure(min_disparity_px=10.0, n_hypotheses=3))
     assert isinstance(result, Consensus)
-    np.testing.assert_allclose(result.T_target_source, T, atol=1e-8)
+    np.testing.assert_allclose(result.T_reference_current, T, atol=1e-8)
 
 
 @given(seed=seeds, n=st.integers(min_value=3, max_value=40))
@@ -177,7 +177,7 @@ def test_as_many_inliers_as_are_needed_are_enough(metric: str) -> None:
     result = run(matches, config)
     assert isinstance(result, Consensus), result
     np.testing.assert_array_equal(result.inliers, is_inlier)
-    np.testing.assert_allclose(result.T_target_source, T, atol=1e-6)
+    np.testing.assert_allclose(result.T_reference_current, T, atol=1e-6)
     _, one_less, _ = scene(rng, 15, 4)
     failure = run(one_less, config)
     assert isinstance(failure, Failure)
@@ -199,41 +199,41 @@ def test_where_near_points_lie_on_a_line_far_ones_tell() -> None:
     rng = np.random.default_rng(5)
     line = np.linspace(2.0, 3.0, 20)[:, np.newaxis] * [0.1, 0.05, 1.0]
     far = 8.0 * random_points(rng, 60) + np.array([0.0, 0.0, 20.0])
-    source, T = np.vstack([line, far]), random_motion(rng)
-    matches = matched(source, move(T, source))
-    is_near = matches.source_uvd[:, 2] >= 5.0
+    reference, T = np.vstack([line, far]), random_motion(rng)
+    matches = matched(reference, seen_from(T, reference))
+    is_near = matches.reference_uvd[:, 2] >= 5.0
     assert is_near[:20].all()
     assert not is_near[20:].any()
     result = run(matches, configure(min_disparity_px=5.0))
     assert isinstance(result, Consensus)
-    np.testing.assert_allclose(result.T_target_source, T, atol=1e-6)
+    np.testing.assert_allclose(result.T_reference_current, T, atol=1e-6)
 
 
 def test_far_points_are_counted_but_not_fitted() -> None:
     T, matches, _ = scene(np.random.default_rng(4), 80, 0)
-    depths = matches.source_points[:, 2]
-    is_far = matches.source_uvd[:, 2] < 25.0
+    depths = matches.reference_points[:, 2]
+    is_far = matches.reference_uvd[:, 2] < 25.0
     assert 20 < is_far.sum() < 60
     # Far points all too near by a tenth: fitted, they would pull the motion along.
-    spoilt = matches.target_points.copy()
+    spoilt = matches.current_points.copy()
     spoilt[is_far] *= 0.9
-    spoilt_matches = replace(matches, target_points=spoilt)
+    spoilt_matches = replace(matches, current_points=spoilt)
     result = run(spoilt_matches, configure(min_disparity_px=30.0, inlier_threshold_px=5.0))
     assert isinstance(result, Consensus)
-    np.testing.assert_allclose(result.T_target_source, T, atol=1e-8)
+    np.testing.assert_allclose(result.T_reference_current, T, atol=1e-8)
     assert result.inliers[depths > 5.0].all()
 
 
 def test_weights_enter_the_last_fit() -> None:
     T, matches, _ = scene(np.random.default_rng(6), 60, 0)
-    shifted = matches.target_points.copy()
+    shifted = matches.current_points.copy()
     shifted[30:] += 0.05
-    noisy = replace(matches, target_points=shifted)
+    noisy = replace(matches, current_points=shifted)
     config = configure(inlier_metric="distance", inlier_threshold_m=1.0)
     weights = np.repeat([1.0, 1e-12], 30)
     result = ransac_rigid(noisy, CAMERA, config, weights=weights, rng=np.random.default_rng(0))
     assert isinstance(result, Consensus)
-    np.testing.assert_allclose(result.T_target_source, T, atol=1e-8)
+    np.testing.assert_allclose(result.T_reference_current, T, atol=1e-8)
 
 
 def count_hypotheses(
@@ -242,9 +242,9 @@ def count_hypotheses(
     """Return how many triples a search fits."""
     n_fitted = []
 
-    def fit(source: FloatArray, target: FloatArray) -> tuple[FloatArray, BoolArray]:
-        n_fitted.append(len(source))
-        return fit_rigid_triples(source, target)
+    def fit(points_a: FloatArray, points_b: FloatArray) -> tuple[FloatArray, BoolArray]:
+        n_fitted.append(len(points_a))
+        return fit_rigid_triples(points_a, points_b)
 
     monkeypatch.setattr(ransac, "fit_rigid_triples", fit)
     run(matches, config)
@@ -271,9 +271,9 @@ def test_only_near_inliers_shorten_the_search(monkeypatch: pytest.MonkeyPatch) -
     # All far points agree, two of three near ones do not: samples are drawn of those.
     _, matches, is_inlier = scene(np.random.default_rng(2), 200, 60)
     is_near = ~is_inlier | (np.cumsum(is_inlier) <= 30)
-    measured = matches.source_uvd.copy()
+    measured = matches.reference_uvd.copy()
     measured[:, 2] = np.where(is_near, 100.0, 5.0)
-    near = replace(matches, source_uvd=measured)
+    near = replace(matches, reference_uvd=measured)
     config = configure(n_hypotheses=1000)
     everywhere = count_hypotheses(monkeypatch, near, config)
     config = config.model_copy(update={"min_disparity_px": 8.0})
@@ -291,31 +291,31 @@ def test_the_sample_that_is_no_line_is_found_however_late(seed: int) -> None:
     # In a block of 64 samples there may well be none: the search goes on.
     rng = np.random.default_rng(seed)
     T = random_motion(rng)
-    source = np.column_stack(
+    reference = np.column_stack(
         [np.linspace(-1, 1, 400), np.linspace(-1, 0.5, 400), np.full(400, 5.0)]
     )
-    source[rng.integers(400)] += [0.0, 2.0, 1.0]
-    target = move(T, source)
-    result = run(matched(source, target), configure(n_hypotheses=3000), 100 + seed)
+    reference[rng.integers(400)] += [0.0, 2.0, 1.0]
+    current = seen_from(T, reference)
+    result = run(matched(reference, current), configure(n_hypotheses=3000), 100 + seed)
     assert isinstance(result, Consensus)
     assert result.inliers.all()
-    np.testing.assert_allclose(result.T_target_source, T, atol=1e-6)
+    np.testing.assert_allclose(result.T_reference_current, T, atol=1e-6)
 
 
 def test_a_fit_that_its_weights_spoil_takes_no_inlier_away() -> None:
     # All weight on three neighbours, each off by less than the threshold: the fit turns far.
     rng = np.random.default_rng(5)
     config = configure(inlier_metric="distance")
-    source = random_points(rng, 30)
-    source[:3] = [0.0, 0.0, 5.0] + 0.1 * np.eye(3)
-    target = source.copy()
-    target[:3] += 0.08 * np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
-    matches = matched(source, target)
+    reference = random_points(rng, 30)
+    reference[:3] = [0.0, 0.0, 5.0] + 0.1 * np.eye(3)
+    current = reference.copy()
+    current[:3] += 0.08 * np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
+    matches = matched(reference, current)
     weights = np.where(np.arange(30) < 3, 1.0, 1e-9)
     result = ransac_rigid(matches, CAMERA, config, weights=weights, rng=rng)
     assert isinstance(result, Consensus)
     assert result.inliers[3:].all()
-    at_fit = find_inliers(result.T_target_source[np.newaxis], matches, CAMERA, config)[0]
+    at_fit = find_inliers(result.T_reference_current[np.newaxis], matches, CAMERA, config)[0]
     assert np.count_nonzero(at_fit) < config.min_inliers
 
 
@@ -330,7 +330,7 @@ def test_what_is_as_far_as_the_threshold_is_no_inlier(metric: str, axis: int) ->
         seen, there = measured.copy(), point.copy()
         seen[0, axis] += 2.0 * share
         there[0, axis] += 0.5 * share
-        matches = matched(point, there, source_uvd=seen, target_uvd=seen)
+        matches = matched(point, there, reference_uvd=seen, current_uvd=seen)
         found = find_inliers(np.eye(4)[None], matches, camera, config)
         assert found.tolist() == [[expected]]
 
@@ -347,7 +347,7 @@ def test_three_matches_are_enough_where_three_are_asked_for() -> None:
     config = configure(min_inliers=3)
     result = run(matches, config)
     assert isinstance(result, Consensus)
-    np.testing.assert_allclose(result.T_target_source, T, atol=1e-6)
+    np.testing.assert_allclose(result.T_reference_current, T, atol=1e-6)
     two = run(matches.select(np.arange(2)), config)
     assert isinstance(two, Failure)
     assert two.reason == "2 matches, 3 are needed (ransac.min_inliers)"
@@ -360,16 +360,16 @@ def test_near_points_are_fitted_alone_where_they_are_as_many_as_are_needed(
     # Of disparities at the bound and a little less; the far ones are all a little off.
     T, matches, _ = scene(np.random.default_rng(9), 40, 0)
     is_near = np.arange(40) < n_near
-    measured = matches.source_uvd.copy()
+    measured = matches.reference_uvd.copy()
     measured[:, 2] = np.where(is_near, 20.0, 19.999)
-    target_uvd = matches.target_uvd.copy()
-    target_uvd[:, 2] = 30.0
-    target = matches.target_points.copy()
-    target[~is_near] += 0.01
-    near = replace(matches, source_uvd=measured, target_uvd=target_uvd, target_points=target)
+    current_uvd = matches.current_uvd.copy()
+    current_uvd[:, 2] = 30.0
+    current = matches.current_points.copy()
+    current[~is_near] += 0.01
+    near = replace(matches, reference_uvd=measured, current_uvd=current_uvd, current_points=current)
     config = configure(inlier_metric="distance", min_disparity_px=20.0)
-    for each in (near, replace(near, source_uvd=target_uvd, target_uvd=measured)):
+    for each in (near, replace(near, reference_uvd=current_uvd, current_uvd=measured)):
         result = run(each, config)
         assert isinstance(result, Consensus)
         assert result.inliers.all()
-        assert (np.abs(result.T_target_source - T).max() < 1e-8) == is_fitted_alone
+        assert (np.abs(result.T_reference_current - T).max() < 1e-8) == is_fitted_alone

@@ -120,8 +120,8 @@ def _sort_tracks(frontend: KltFrontend, asked: Asked, attempt: _Attempt) -> Sort
         "track lost": as_mask(tracked, n),
         "no disparity or depth": as_mask(measured.matches[:, 0], n),
     }
-    source = asked.reference.keypoints
-    return Sorting(tests=tests, pixels=source, partners=found, predicted=predicted)
+    keypoints = asked.reference.keypoints
+    return Sorting(tests=tests, pixels=keypoints, partners=found, predicted=predicted)
 
 
 def _sort_descriptors(
@@ -158,11 +158,11 @@ def _find_motion(
     T_start = frontend.calibrated.begin(measured, config, prior=prior, is_step=step)
     matches = frontend.calibrated.prepare(measured, T_start)
     if T_start is None and prior is not None:
-        T_start = se3.invert(prior.T_predicted)
+        T_start = prior.T_predicted
     stamps_ns = measured.frames[0].stamp_ns, measured.frames[1].stamp_ns
     consensus = find_consensus(matches, camera, config, stamps_ns, T_start)
     offset = [0.0, 0.0, frontend.rig_offsets.disparity_px]
-    moved = np.abs(matches.target_uvd - (measured.uvd[1] - offset))
+    moved = np.abs(matches.current_uvd - (measured.uvd[1] - offset))
     motion: dict[str, Any] = {
         "n_consensus": 0,
         "is_known": False,
@@ -174,10 +174,10 @@ def _find_motion(
     if isinstance(consensus, Failure):
         return motion
     motion["n_consensus"] = int(np.count_nonzero(consensus.inliers))
-    motion["is_known"] = consensus.T_target_source is T_start
+    motion["is_known"] = consensus.T_reference_current is T_start
     if isinstance(result, Failure):
         return motion | {"inliers": consensus.inliers}
-    ends = consensus.T_target_source, se3.invert(result.T_reference_current)
+    ends = consensus.T_reference_current, result.T_reference_current
     residuals_px = np.stack([_residuals(T, matches, camera) for T in ends])
     known = StereoResiduals.of(ends[0], matches, camera)
     whitened = residuals_px.transpose(0, 2, 1).copy()
@@ -191,6 +191,6 @@ def _find_motion(
 
 
 def _residuals(T: FloatArray, matches: Correspondences, camera: StereoCamera) -> FloatArray:
-    points = se3.transform_points(T, matches.source_points)
+    points = se3.transform_points(se3.invert(T), matches.reference_points)
     points[points[:, 2] < _MIN_DEPTH_M] = np.nan
-    return np.asarray(matches.target_uvd - camera.project_stereo(points))
+    return np.asarray(matches.current_uvd - camera.project_stereo(points))
