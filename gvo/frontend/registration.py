@@ -21,7 +21,6 @@ from gvo.geometry.ransac import Consensus, find_inliers, ransac_rigid
 from gvo.geometry.refinement import Refinement, descend, fit_covariance, refine_pose
 from gvo.geometry.residuals import StereoResiduals
 from gvo.types import (
-    BoolArray,
     Failure,
     FloatArray,
     IntArray,
@@ -99,13 +98,18 @@ def register_correspondences(
     consensus = find_consensus(correspondences, camera, config, stamps_ns, T_start)
     if isinstance(consensus, Failure):
         return consensus
-    refined = _refine(consensus, correspondences, camera, config)
-    if isinstance(refined, Refinement) and config.registration.refine != "none":
-        refined = verify_motion(
-            *(refined, correspondences, camera, config),
-            prior=prior,
-            make_rng=partial(_rng, config, stamps_ns),
-        )
+    found = consensus.T_reference_current, correspondences, consensus.inliers, camera
+    refined: Refinement | Failure
+    if config.registration.refine == "none":
+        refined = fit_covariance(*found)
+    else:
+        refined = refine_pose(*found)
+        if isinstance(refined, Refinement):
+            refined = verify_motion(
+                *(refined, correspondences, camera, config),
+                prior=prior,
+                make_rng=partial(_rng, config, stamps_ns),
+            )
     return _conclude(refined, consensus, correspondences, matches, config.ransac.min_inliers)
 
 
@@ -142,28 +146,18 @@ def find_consensus(
 
     Arguments are those of `register_correspondences`; the start is a T_reference_current.
     """
-    known = _known_consensus(T_start, correspondences, camera, config)
-    return known or _search_consensus(correspondences, camera, config, stamps_ns)
-
-
-def _known_consensus(
-    T: FloatArray | None, correspondences: Correspondences, camera: StereoCamera, config: Config
-) -> Consensus | None:
-    """Return the inliers of the start value, if they are most of the matches."""
-    if T is None or config.registration.refine == "none":
-        return None
-    inliers = find_inliers(T[np.newaxis], correspondences, camera, config.ransac)[0]
-    n_needed = max(config.ransac.min_inliers, _MIN_KNOWN_SHARE * len(correspondences))
-    if np.count_nonzero(inliers) < n_needed:
-        return None
-    return Consensus(T_reference_current=T, inliers=inliers)
-
-
-def _refine(
-    consensus: Consensus, correspondences: Correspondences, camera: StereoCamera, config: Config
-) -> Refinement | Failure:
-    refine = fit_covariance if config.registration.refine == "none" else refine_pose
-    return refine(consensus.T_reference_current, correspondences, consensus.inliers, camera)
+    ransac, is_refined = config.ransac, config.registration.refine != "none"
+    if T_start is not None and is_refined:
+        inliers = find_inliers(T_start[np.newaxis], correspondences, camera, ransac)[0]
+        n_needed = max(ransac.min_inliers, _MIN_KNOWN_SHARE * len(correspondences))
+        if np.count_nonzero(inliers) >= n_needed:
+            return Consensus(T_reference_current=T_start, inliers=inliers)
+    # Depth noise grows with z^2; 1/z^2 as a weight keeps near points in the lead without
+    # giving up the far ones, which hold the rotation.
+    is_weighted = config.registration.weighting != "none"
+    weights = 1.0 / correspondences.current_points[:, 2] ** 2 if is_weighted else None
+    rng = _rng(config, stamps_ns)
+    return ransac_rigid(correspondences, camera, ransac, weights=weights, rng=rng)
 
 
 def _conclude(
@@ -178,29 +172,25 @@ def _conclude(
         n_inliers = int(np.count_nonzero(consensus.inliers))
         return replace(refined, n_matches=len(matches), n_inliers=n_inliers)
     n_inliers = int(np.count_nonzero(refined.inliers))
-    if n_inliers >= min_inliers:
-        return _relative_pose(refined, correspondences, matches)
-    return Failure(
-        reason=f"{n_inliers} of {len(matches)} matches fit the refined motion, "
-        f"{min_inliers} are needed (ransac.min_inliers)",
-        n_matches=len(matches),
-        n_inliers=n_inliers,
-    )
-
-
-def _search_consensus(
-    correspondences: Correspondences,
-    camera: StereoCamera,
-    config: Config,
-    stamps_ns: tuple[int, int],
-) -> Consensus | Failure:
-    """Find the consensus of the matches by RANSAC; as `register_correspondences`."""
-    return ransac_rigid(
-        correspondences,
-        camera,
-        config.ransac,
-        weights=_weights(correspondences, config),
-        rng=_rng(config, stamps_ns),
+    if n_inliers < min_inliers:
+        return Failure(
+            reason=f"{n_inliers} of {len(matches)} matches fit the refined motion, "
+            f"{min_inliers} are needed (ransac.min_inliers)",
+            n_matches=len(matches),
+            n_inliers=n_inliers,
+        )
+    pixels = correspondences.reference_uvd[:, :2], correspondences.current_uvd[:, :2]
+    displacements = (pixels[1] - pixels[0])[refined.inliers]
+    return RelativePose(
+        T_reference_current=refined.T_reference_current,
+        covariance=refined.covariance,
+        matches=matches,
+        inliers=refined.inliers,
+        pixels_reference=pixels[0],
+        pixels_current=pixels[1],
+        points_current=correspondences.current_points,
+        flow_px=float(np.median(np.hypot(*displacements.T))),
+        calibration_errors=refined.calibration_errors,
     )
 
 
@@ -209,35 +199,6 @@ def _rng(config: Config, stamps_ns: tuple[int, int]) -> np.random.Generator:
     # anywhere draws the same samples for them.
     seeds = [config.ransac.seed, *stamps_ns]
     return np.random.default_rng([abs(seed) for seed in seeds])
-
-
-def _relative_pose(
-    refined: Refinement, correspondences: Correspondences, matches: IntArray
-) -> RelativePose:
-    return RelativePose(
-        T_reference_current=refined.T_reference_current,
-        covariance=refined.covariance,
-        matches=matches,
-        inliers=refined.inliers,
-        pixels_reference=correspondences.reference_uvd[:, :2],
-        pixels_current=correspondences.current_uvd[:, :2],
-        points_current=correspondences.current_points,
-        flow_px=_flow(correspondences, refined.inliers),
-        calibration_errors=refined.calibration_errors,
-    )
-
-
-def _flow(correspondences: Correspondences, inliers: BoolArray) -> float:
-    displacements = correspondences.current_uvd[:, :2] - correspondences.reference_uvd[:, :2]
-    return float(np.median(np.hypot(*displacements[inliers].T)))
-
-
-def _weights(correspondences: Correspondences, config: Config) -> FloatArray | None:
-    if config.registration.weighting == "none":
-        return None
-    # Depth noise grows with z^2; 1/z^2 as a weight keeps near points in the lead without
-    # giving up the far ones, which hold the rotation.
-    return np.asarray(1.0 / correspondences.current_points[:, 2] ** 2)
 
 
 def match_anywhere(reference: Sequence[NDArray[Any]], current: Sequence[NDArray[Any]]) -> IntArray:

@@ -101,30 +101,24 @@ class ConstantFilter:
 
     Attributes
     ----------
-    value : float
-        The present estimate.
+    value, sigma : float
+        The present estimate, and its standard deviation.
     """
 
     def __init__(self, prior_sigma: float, drift: float, value: float = 0.0) -> None:
-        self._prior_variance = prior_sigma**2
-        self._variance = self._prior_variance
-        self._drift, self.value = drift, value
-
-    @property
-    def sigma(self) -> float:
-        """Standard deviation of the value."""
-        return math.sqrt(self._variance)
+        self._prior_sigma, self._drift = prior_sigma, drift
+        self.value, self.sigma = value, prior_sigma
 
     def advance(self) -> None:
         """Let the value drift for a frame."""
-        self._variance = min(self._variance + self._drift**2, self._prior_variance)
+        self.sigma = min(math.hypot(self.sigma, self._drift), self._prior_sigma)
 
     def update(self, error: float, sigma: float) -> None:
         """Add a measurement of what is left of the value, and its standard deviation."""
-        limit = _MAX_SURPRISE * math.sqrt(self._variance + sigma**2)
-        gain = self._variance / (self._variance + sigma**2)
+        limit = _MAX_SURPRISE * math.hypot(self.sigma, sigma)
+        gain = self.sigma**2 / (self.sigma**2 + sigma**2)
         self.value += gain * min(max(error, -limit), limit)
-        self._variance *= 1.0 - gain
+        self.sigma *= math.sqrt(1.0 - gain)
 
 
 class VarianceFactor:
@@ -309,6 +303,14 @@ class RigOffsets:
         Time from the first to the last row, seconds.
     learnt : dict of str to ConstantFilter
         Those of them that registrations tell, by name.
+    disparity_px : float
+        The offset that is taken off disparities, pixels: what was learnt beyond a twentieth of a
+        pixel. So much is feigned by lenses and by patches that hold more than one surface.
+    readout_s : float
+        The readout time that is reckoned with, seconds: zero where it may be zero. A global
+        shutter is not to be bent by what is left of the noise.
+    possible_readout_s : float
+        How long the readout may be, seconds: zero where it is known to take no time.
     chain_factor, window_factor : VarianceFactor
         Of the covariances of registrations where they are chained, and where they are smoothed:
         by loops of links and steps, and by the edges of one frame in the window.
@@ -337,31 +339,18 @@ class RigOffsets:
         self._disparity_error: ConstantError | None = None
         self._readout_errors: list[ConstantError] = []
         self._row_px: float | None = None
+        self._settle()
 
-    @property
-    def disparity_px(self) -> float:
-        """The offset that is taken off disparities, pixels.
-
-        It is what was learnt beyond a twentieth of a pixel: so much is feigned by lenses and by
-        patches that hold more than one surface.
-        """
-        learnt_px = self.disparity.value
-        return math.copysign(max(abs(learnt_px) - _FEIGNED_PX, 0.0), learnt_px)
-
-    @property
-    def readout_s(self) -> float:
-        """The readout time that is reckoned with, seconds: zero where it may be zero.
-
-        A global shutter is not to be bent by what is left of the noise.
-        """
-        return self.readout.value if abs(self.readout.value) > self.readout.sigma else 0.0
-
-    @property
-    def possible_readout_s(self) -> float:
-        """How long the readout may be, seconds: zero where it is known to take no time."""
-        longest_s = abs(self.readout.value) + self.readout.sigma
-        is_possible = self.readout_s != 0.0 or longest_s > _LEAST_READOUT_S
-        return math.hypot(self.readout_s, self.readout.sigma) if is_possible else 0.0
+    def _settle(self) -> None:
+        """Say what registrations take off, from now on."""
+        learnt_px, longest_s = self.disparity.value, abs(self.readout.value) + self.readout.sigma
+        self.disparity_px = math.copysign(max(abs(learnt_px) - _FEIGNED_PX, 0.0), learnt_px)
+        is_rolling = abs(self.readout.value) > self.readout.sigma
+        self.readout_s = self.readout.value if is_rolling else 0.0
+        is_possible = is_rolling or longest_s > _LEAST_READOUT_S
+        self.possible_readout_s = (
+            math.hypot(self.readout_s, self.readout.sigma) if is_possible else 0.0
+        )
 
     def reconfigure(self, config: Config) -> None:
         """Forget the variance factors where another front-end states other covariances."""
@@ -395,11 +384,11 @@ class RigOffsets:
             self.disparity.update(left_px, _DISPARITY_FACTOR * error.sigma)
         if self._row_px is not None:
             self.row.update(self._row_px - self.row.value, _ROW_SIGMA_PX)
-        used_s = self.readout_s
         for error in self._readout_errors:
-            left_s = used_s + error.value - self.readout.value
+            left_s = self.readout_s + error.value - self.readout.value
             self.readout.update(left_s, _READOUT_FACTOR * error.sigma)
         self._disparity_error, self._row_px, self._readout_errors = None, None, []
+        self._settle()
 
     def as_json(self) -> dict[str, float]:
         """Return values and sigmas as plain numbers; a sigma of 0: it was given."""
@@ -533,10 +522,10 @@ class Measurements:
     matches: IntArray
     sigma_factor: float
 
-
-def _hints(measured: Measurements, prior: MotionPrior | None) -> dict[str, Any]:
-    first, second = measured.frames
-    return {"stamps_ns": (first.stamp_ns, second.stamp_ns), "prior": prior}
+    @property
+    def stamps_ns(self) -> tuple[int, int]:
+        """Stamps of reference and current."""
+        return self.frames[0].stamp_ns, self.frames[1].stamp_ns
 
 
 class CalibratedCamera:
@@ -557,17 +546,13 @@ class CalibratedCamera:
 
     def correct(self, observations: Moving, uvd: FloatArray) -> FloatArray:
         """Return measured (u, v, disparity), shape (n, 3), as a camera without errors has them."""
-        velocity = observations.motion.velocity
-        return settle_rows(uvd - self._offset(), velocity, self._offsets.readout_s, self._camera)
+        velocity, offset = observations.motion.velocity, [0.0, 0.0, self._offsets.disparity_px]
+        return settle_rows(uvd - offset, velocity, self._offsets.readout_s, self._camera)
 
     def distort(self, observations: Moving, uvd: FloatArray) -> FloatArray:
         """Return (u, v, disparity), shape (n, 3), as this camera measures them."""
-        velocity = observations.motion.velocity
-        readout_s = -self._offsets.readout_s
-        return settle_rows(uvd, velocity, readout_s, self._camera) + self._offset()
-
-    def _offset(self) -> FloatArray:
-        return np.array([0.0, 0.0, self._offsets.disparity_px])
+        velocity, offset = observations.motion.velocity, [0.0, 0.0, self._offsets.disparity_px]
+        return settle_rows(uvd, velocity, -self._offsets.readout_s, self._camera) + offset
 
     def register(
         self, measured: Measurements, config: Config, *, prior: MotionPrior | None, is_step: bool
@@ -589,33 +574,45 @@ class CalibratedCamera:
         -------
         RelativePose or Failure
         """
-        first, second = measured.frames
+        frames = measured.frames
         T_start = self.begin(measured, config, prior=prior, is_step=is_step)
-        hints: dict[str, Any] = {**_hints(measured, prior), "T_start": T_start}
-        result = self._register(measured, config, hints)
-        if isinstance(result, Failure) and hints.pop("T_start", None) is not None:
+        result = self._register(measured, config, prior, T_start)
+        if isinstance(result, Failure) and T_start is not None:
             # What was found roughly may be the other one of two motions, or none.
-            note_step(first, second, None if prior is None else prior.T_predicted)
-            result = self._register(measured, config, hints)
+            note_step(*frames, None if prior is None else prior.T_predicted)
+            result = self._register(measured, config, prior, None)
         if isinstance(result, Failure):
             return result
-        if is_step and second.motion.measured is None:
-            note_step(first, second, result.T_reference_current)
+        if is_step and frames[1].motion.measured is None:
+            note_step(*frames, result.T_reference_current)
         self._found = measured
         return check_rows(result, self._camera)
 
     def begin(
         self, measured: Measurements, config: Config, *, prior: MotionPrior | None, is_step: bool
     ) -> FloatArray | None:
-        """Take over the velocities of a step, estimated roughly; return it, T_reference_current.
+        """Take over the velocities of a step, estimated roughly; return its T_reference_current.
 
-        None where rows need no velocities, or where that fails.
+        None where rows need no velocities; where that fails, the step is tried again as a whole, to
+        tell why.
         """
+        frames = measured.frames
         # A first step has no velocity yet to start from.
-        has_velocity = measured.frames[0].motion.velocity is not None
-        if is_step and has_velocity and self._offsets.possible_readout_s:
-            return self._move_rows(measured, config, _hints(measured, prior))
-        return None
+        if not (is_step and frames[0].motion.velocity is not None):
+            return None
+        if not self._offsets.possible_readout_s:
+            return None
+        corrected, stamps_ns = self._corrected(measured), measured.stamps_ns
+        T = estimate_roughly(corrected, self._camera, config, stamps_ns=stamps_ns, prior=prior)
+        if isinstance(T, Failure):
+            return None
+        note_step(*frames, T)
+        told = self._measure_velocity(measured, T, config)
+        if told is None:
+            return T
+        note_step(*frames, told.found.T_reference_current)
+        frames[1].motion.measure(told)
+        return told.found.T_reference_current
 
     def accept(self, result: RelativePose, config: Config, *, is_step: bool) -> None:
         """Learn from a registration that passed all checks; from the others nothing is learnt."""
@@ -628,31 +625,19 @@ class CalibratedCamera:
         if READOUT in self._offsets.learnt:
             self._accepted.append((measured, result))
 
-    def _move_rows(
-        self, measured: Measurements, config: Config, hints: Mapping[str, Any]
-    ) -> FloatArray | None:
-        """Take over the velocities of both frames by a rough step; return its T_reference_current.
-
-        What fails, None, is tried again as a whole, to tell why.
-        """
-        frames = measured.frames
-        rough = estimate_roughly(self._corrected(measured), self._camera, config, **hints)
-        if isinstance(rough, Failure):
-            return None
-        note_step(*frames, rough)
-        told = self._measure_velocity(measured, rough, config)
-        if told is None:
-            return rough
-        note_step(*frames, told.found.T_reference_current)
-        frames[1].motion.measure(told)
-        return told.found.T_reference_current
-
     def _register(
-        self, measured: Measurements, config: Config, hints: Mapping[str, Any]
+        self,
+        measured: Measurements,
+        config: Config,
+        prior: MotionPrior | None,
+        T_start: FloatArray | None,
     ) -> RelativePose | Failure:
-        T_start = hints.get("T_start")
-        prepared = self.prepare(measured, T_start)
-        result = register_correspondences(prepared, measured.matches, self._camera, config, **hints)
+        result = register_correspondences(
+            *(self.prepare(measured, T_start), measured.matches, self._camera, config),
+            stamps_ns=measured.stamps_ns,
+            prior=prior,
+            T_start=T_start,
+        )
         if isinstance(result, Failure):
             return result
         T_correction = se3.exp(measured.frames[0].motion.error())
@@ -733,10 +718,17 @@ class CalibratedCamera:
         told = measured.frames[1].motion.measured
         is_adjusted = told is not None and T_start is not None
         corrected = self._corrected(measured)
-        sensitivities = {
-            name: self._sensitivity(name, measured) * constant.sigma
-            for name, constant in self._offsets.learnt.items()
-        }
+        sensitivities, learnt = {}, self._offsets.learnt
+        if DISPARITY in learnt:
+            by_disparity = np.array([0.0, 0.0, learnt[DISPARITY].sigma])
+            sensitivities[DISPARITY] = np.tile(by_disparity, (2, len(corrected), 1))
+        if READOUT in learnt:
+            offset = [0.0, 0.0, self._offsets.disparity_px]
+            rates = [
+                settling_rates(uvd - offset, frame.motion.velocity, self._camera)
+                for frame, uvd in zip(measured.frames, measured.uvd, strict=True)
+            ]
+            sensitivities[READOUT] = -learnt[READOUT].sigma * np.stack(rates)
         sigmas = measured.frames[1].motion.sigmas
         # What a readout that is not known yet may do counts, too.
         readout_s = self._offsets.possible_readout_s
@@ -762,14 +754,3 @@ class CalibratedCamera:
             told = {} if isinstance(at, Failure) else estimate_constants(T, residuals, at)
             if READOUT in told:
                 self._offsets.note_readout(told[READOUT].times(self._offsets.readout.sigma), result)
-
-    def _sensitivity(self, name: str, measured: Measurements) -> FloatArray:
-        """Return the derivatives of corrected measurements by an error of a constant."""
-        if name == DISPARITY:
-            return np.tile([0.0, 0.0, 1.0], (2, len(measured.matches), 1))
-        velocities = [frame.motion.velocity for frame in measured.frames]
-        rates = [
-            settling_rates(uvd - self._offset(), velocity, self._camera)
-            for velocity, uvd in zip(velocities, measured.uvd, strict=True)
-        ]
-        return -np.stack(rates)

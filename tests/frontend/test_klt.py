@@ -183,7 +183,7 @@ def test_what_is_not_known_yet_of_the_camera_is_doubted_in_the_covariance() -> N
     assert np.linalg.matrix_rank(doubt, tol=1e-3 * np.linalg.norm(doubt)) == 1
     np.testing.assert_allclose(large - medium, 3.0 * doubt, rtol=1e-3, atol=1e-3 * abs(doubt).max())
     moved = frontend("stereo", camera={"readout_ms": 0.0}, stereo={"estimate_offset": False})
-    moved.rig_offsets.disparity.value = 0.15  # of which 0.1 are taken off
+    moved.rig_offsets.disparity_px = 0.1
     with_offset = moved.register(first, second)
     assert isinstance(results[0], RelativePose)
     assert isinstance(with_offset, RelativePose)
