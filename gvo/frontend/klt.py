@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Literal, Protocol, TypeAlias, cast
+from typing import Literal, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,14 +111,18 @@ class KltFrontend:
         frame : StereoFrame or RgbdFrame
         """
         self.rig_offsets.advance()
-        half = halve(image_of(frame))
-        corners = self._find_corners(frame, half, self._config.klt.n_corners)
-        depth = (
-            DepthImage(frame, self.camera, self._config.depth)
-            if isinstance(frame, RgbdFrame)
-            else None
+        image, depth = image_of(frame), None
+        if isinstance(frame, RgbdFrame):
+            depth = DepthImage(frame, self.camera, self._config.depth)
+        half = halve(image)
+        return KltObservations(
+            stamp_ns=frame.stamp_ns,
+            frame=frame,
+            image=image,
+            half=half,
+            corners=self._find_corners(frame, half, self._config.klt.n_corners),
+            depth=depth,
         )
-        return KltObservations(frame=frame, half=half, corners=corners, depth=depth)
 
     def _find_corners(
         self, frame: Frame, half: ImageArray, n_corners: int, *, spacing_px: int = SPACING_PX
@@ -140,15 +144,14 @@ class KltFrontend:
         else:
             disparities, is_valid = self._measure_depth(frame, corners)
             slopes = np.zeros_like(corners)
-        keypoints, disparities = corners[is_valid], disparities[is_valid]
+        uvd = np.column_stack([corners, disparities])[is_valid]
         return KltCorners(
-            keypoints=keypoints,
-            disparities=disparities,
+            uvd=uvd,
             slopes=slopes[is_valid],
-            points_cam=self.camera.unproject_stereo(keypoints, disparities - offset_px),
+            points_cam=self.camera.unproject_stereo(uvd[:, :2], uvd[:, 2] - offset_px),
             n_keypoints=len(corners),
             row_px=row_px,
-            templates=Templates.of(image_of(frame), keypoints),
+            templates=Templates.of(image_of(frame), uvd[:, :2]),
         )
 
     def register(
@@ -172,8 +175,7 @@ class KltFrontend:
             The second column of `matches` is -1: tracks do not end at observations.
         """
         result = self._register(reference, current, prior)
-        if isinstance(result, RelativePose):
-            result = self._check_depth(reference, current, result)
+        result = self._check_depth(result, reference.depth_points, current.frame)
         if isinstance(result, RelativePose):
             is_step = prior is None or prior.T_recent is not None
             self.calibrated.accept(result, self._config, is_step=is_step)
@@ -232,11 +234,12 @@ class KltFrontend:
         return self._describe(observations, corners)
 
     def _describe(self, observations: KltObservations, corners: KltCorners) -> KltPlace:
-        image, chosen = observations.image, thin(len(corners.keypoints))
-        keypoints, grid = corners.keypoints[chosen], observations.depth_points
+        image, chosen = observations.image, thin(len(corners.uvd))
+        uvd, grid = corners.uvd[chosen], observations.depth_points
+        keypoints = uvd[:, :2]
         return KltPlace(
             stamp_ns=observations.stamp_ns,
-            pixels=np.column_stack([keypoints, corners.disparities[chosen]]).astype(np.float32),
+            uvd=uvd.astype(np.float32),
             points=corners.points_cam[chosen].astype(np.float32),
             slopes=corners.slopes[chosen].astype(np.float32),
             patches=cut_patches(image, keypoints, RADIUS_PX + 1),
@@ -265,26 +268,24 @@ class KltFrontend:
         if isinstance(rough, Failure):
             return rough
         prior = MotionPrior(T_predicted=rough.T_reference_current)
-        result = self._register_link(prior, reference, observations)
-        points, frame = reference.depth_points, observations.frame
-        checked = self._check_view(result, reference, points, frame)
-        if isinstance(checked, Failure) or points is None or not isinstance(frame, RgbdFrame):
-            return checked
-        depths = points.astype(np.float64), frame.depth, self.camera, self._config.depth
-        return check_depths(checked, *depths)
+        corners, grid = reference.unpack(), reference.depth_points
+        result = self._register_link(prior, corners, observations)
+        points = None if grid is None else grid.astype(np.float64)
+        checked = self._check_view(result, corners, points, observations.frame)
+        return self._check_depth(checked, points, observations.frame)
 
     def _check_view(
         self,
         result: RelativePose | Failure,
-        reference: _Reference,
-        points: NDArray[np.floating] | None,
+        reference: KltReference,
+        points: FloatArray | None,
         frame: Frame,
     ) -> RelativePose | Failure:
         """Refuse a motion that too few points in view confirm, or depth images for them."""
         checked = check_view(result, reference.points_cam, self.camera)
         if isinstance(result, Failure) or points is None or not isinstance(frame, RgbdFrame):
             return checked
-        depths = points.astype(np.float64), frame.depth, self.camera, self._config.depth
+        depths = points, frame.depth, self.camera, self._config.depth
         if isinstance(checked, Failure) and is_seen_again(result, *depths):
             return check_view(result, reference.points_cam, self.camera, depths_agree=True)
         return checked
@@ -300,21 +301,21 @@ class KltFrontend:
 
     def _as_observations(self, place: KltPlace) -> Observations:
         sigmas = np.ones((len(place.uvd), 3)) * [1.0, 1.0, self._sigmas(1)[0][0, 2]]
+        uvd = place.uvd.astype(np.float64)
         return Observations(
             stamp_ns=place.stamp_ns,
-            keypoints=place.keypoints,
-            disparities=place.uvd[:, 2],
+            keypoints=uvd[:, :2],
+            disparities=uvd[:, 2],
             points_cam=place.points_cam,
             sigmas=sigmas,
             descriptors_left=place.descriptors_left,
         )
 
     def _check_depth(
-        self, reference: KltObservations, current: KltObservations, result: RelativePose
+        self, result: RelativePose | Failure, points: FloatArray | None, frame: Frame
     ) -> RelativePose | Failure:
         """Refuse a motion that the depth images of an RGB-D camera contradict."""
-        points, frame = reference.depth_points, current.frame
-        if points is None or not isinstance(frame, RgbdFrame):
+        if isinstance(result, Failure) or points is None or not isinstance(frame, RgbdFrame):
             return result
         return check_depths(result, points, frame.depth, self.camera, self._config.depth)
 
@@ -350,7 +351,7 @@ class KltFrontend:
         return self._track(reference, current, expected, "wide" if is_wide else "near")
 
     def _register_link(
-        self, prior: MotionPrior, reference: _Reference, current: KltObservations
+        self, prior: MotionPrior, reference: KltReference, current: KltObservations
     ) -> RelativePose | Failure:
         """Align corners where they are expected, measure, register; velocities stay as they are."""
         expected = self.predict(prior.T_predicted, reference, current)
@@ -367,7 +368,7 @@ class KltFrontend:
 
     def _track(
         self,
-        reference: _Reference,
+        reference: KltReference,
         current: KltObservations,
         expected: Expected,
         search: _Search,
@@ -379,20 +380,21 @@ class KltFrontend:
         disparities, is_valid = self._measure(current.frame, pixels, expected, search)
         valid = np.flatnonzero(is_valid)
         indices = expected.indices.take(valid)
-        current_uvd = np.column_stack([pixels, disparities]).take(valid, axis=0)
+        uvd = np.column_stack([pixels, disparities]).take(valid, axis=0)
         return Measurements(
             frames=(reference, current),
-            uvd=(reference.uvd.take(indices, axis=0), current_uvd),
+            uvd=(reference.corners.uvd.take(indices, axis=0), uvd),
             sigmas=self._sigmas(len(indices)),
             matches=np.column_stack([indices, np.full_like(indices, -1)]),
             sigma_factor=KLT_SIGMA_FACTOR,
         )
 
     def predict(
-        self, T_reference_current: FloatArray, reference: _Reference, current: KltObservations
+        self, T_reference_current: FloatArray, reference: KltReference, current: KltObservations
     ) -> Expected:
         """Return the corners that are in view of the current camera after a motion."""
-        settled = self.calibrated.correct(reference, reference.uvd)
+        corners = reference.corners
+        settled = self.calibrated.correct(reference, corners.uvd)
         points = self.camera.unproject_stereo(settled[:, :2], settled[:, 2])
         T_current_reference = se3.invert(T_reference_current)
         points = se3.transform_points(T_current_reference, points)
@@ -400,14 +402,9 @@ class KltFrontend:
         seen = self.calibrated.distort(current, self.camera.project_stereo(points[in_front]))
         in_view = np.flatnonzero(self.camera.is_in_view(seen[:, :2]))
         indices = in_front.take(in_view)
-        offset = np.array([0.0, 0.0, self.rig_offsets.disparity_px])
-        slopes = reference.slopes.take(indices, axis=0).astype(np.float64, copy=False)
-        surfaces = (
-            reference.uvd.take(indices, axis=0) - offset,
-            slopes,
-            T_current_reference,
-            self.camera,
-        )
+        slopes, uvd = (each.take(indices, axis=0) for each in (corners.slopes, corners.uvd))
+        uvd[:, 2] -= self.rig_offsets.disparity_px
+        surfaces = uvd, slopes, T_current_reference, self.camera
         return Expected(
             T_reference_current=T_reference_current,
             indices=indices,
@@ -418,7 +415,7 @@ class KltFrontend:
 
     def find_tracks(
         self,
-        reference: _Reference,
+        reference: KltReference,
         current: KltObservations,
         expected: Expected,
         search: _Search,
@@ -447,12 +444,12 @@ class KltFrontend:
 
     def _align(
         self,
-        reference: _Reference,
+        reference: KltReference,
         current: KltObservations,
         expected: Expected,
         start: FloatArray,
     ) -> tuple[FloatArray, BoolArray]:
-        templates = reference.templates.take(expected.indices)
+        templates = reference.corners.templates.take(expected.indices)
         pixels, is_found = templates.align(current.image, start, expected.warps)
         return pixels, is_found & self.camera.is_in_view(pixels)
 
@@ -485,12 +482,11 @@ class KltCorners:
 
     Parameters
     ----------
-    keypoints : ndarray of float64, shape (n, 2)
-        Pixels (u, v) in the left or colour image.
-    disparities : ndarray of float64, shape (n,)
-        Disparity in pixels, as measured; for RGB-D the virtual one, fx * baseline / depth.
+    uvd : ndarray of float64, shape (n, 3)
+        Pixels (u, v) in the left or colour image, and disparities, as measured; for RGB-D the
+        virtual ones, fx * baseline / depth.
     slopes : ndarray of float64, shape (n, 2)
-        Its change per pixel, along rows and columns; zero for RGB-D.
+        Change of the disparity per pixel, along rows and columns; zero for RGB-D.
     points_cam : ndarray of float64, shape (n, 3)
         Points in the `cam` frame, metres, the disparities corrected by the offset known then.
     templates : Templates
@@ -501,8 +497,7 @@ class KltCorners:
         Row offset of the right image; None where not measured.
     """
 
-    keypoints: FloatArray
-    disparities: FloatArray
+    uvd: FloatArray
     slopes: FloatArray
     points_cam: FloatArray
     templates: Templates
@@ -545,88 +540,55 @@ class Expected:
         )
 
 
-class _Reference(Protocol):
-    """Corners that are tracked: those of a frame, or of a place."""
-
-    @property
-    def stamp_ns(self) -> int: ...
-
-    @property
-    def motion(self) -> FrameMotion: ...
-
-    @property
-    def keypoints(self) -> FloatArray: ...
-
-    @property
-    def uvd(self) -> FloatArray: ...
-
-    @property
-    def slopes(self) -> NDArray[np.floating]: ...
-
-    @property
-    def points_cam(self) -> FloatArray: ...
-
-    @property
-    def templates(self) -> Templates: ...
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class KltObservations:
-    """A frame to track corners into, and its own corners.
+class KltReference:
+    """Corners to be tracked into another frame: those of a frame, or of a place.
 
     Parameters
     ----------
-    frame : StereoFrame or RgbdFrame
-    half : ndarray of uint8, shape (height // 2, width // 2)
-        The image to track in, of half the size.
+    stamp_ns : int
+        Stamp of the frame, nanoseconds.
     corners : KltCorners
-        Its own, tracked when the next frame comes.
-    depth : DepthImage or None
-        None for stereo.
     motion : FrameMotion
         Filled in by the steps before and after the frame.
     """
 
-    frame: Frame
-    half: ImageArray
+    stamp_ns: int
     corners: KltCorners
-    depth: DepthImage | None = field(default=None, compare=False)
     motion: FrameMotion = field(default_factory=FrameMotion, compare=False)
-
-    @property
-    def stamp_ns(self) -> int:
-        """Stamp of the frame, nanoseconds."""
-        return self.frame.stamp_ns
-
-    @property
-    def image(self) -> ImageArray:
-        """The image to track in, left or colour."""
-        return image_of(self.frame)
-
-    @property
-    def keypoints(self) -> FloatArray:
-        """Pixels (u, v) of the corners, shape (n, 2)."""
-        return self.corners.keypoints
-
-    @property
-    def uvd(self) -> FloatArray:
-        """Pixels and disparities of the corners as measured, shape (n, 3)."""
-        return np.column_stack([self.keypoints, self.corners.disparities])
 
     @property
     def points_cam(self) -> FloatArray:
         """The corners as points in the `cam` frame, metres, shape (n, 3)."""
         return self.corners.points_cam
 
-    @property
-    def slopes(self) -> FloatArray:
-        """Changes of the disparities per pixel, along rows and columns, shape (n, 2)."""
-        return self.corners.slopes
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class KltObservations(KltReference):
+    """A frame to track corners into, and its own corners, tracked when the next frame comes.
+
+    Parameters
+    ----------
+    stamp_ns, corners, motion
+        See `KltReference`.
+    frame : StereoFrame or RgbdFrame
+    image : ndarray of uint8, shape (height, width)
+        Its image to track in, left or colour.
+    half : ndarray of uint8, shape (height // 2, width // 2)
+        The same, of half the size.
+    depth : DepthImage or None
+        None for stereo.
+    """
+
+    frame: Frame
+    image: ImageArray
+    half: ImageArray
+    depth: DepthImage | None = field(default=None, compare=False)
 
     @property
-    def templates(self) -> Templates:
-        """The patches around the corners."""
-        return self.corners.templates
+    def keypoints(self) -> FloatArray:
+        """Pixels (u, v) of the corners, shape (n, 2)."""
+        return self.corners.uvd[:, :2]
 
     @property
     def depth_points(self) -> FloatArray | None:
@@ -640,7 +602,7 @@ class KltObservations:
 
     def __len__(self) -> int:
         """Return the number of points."""
-        return len(self.keypoints)
+        return len(self.corners.uvd)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -651,7 +613,7 @@ class KltPlace:
     ----------
     stamp_ns : int
         Stamp of the frame, nanoseconds.
-    pixels : ndarray of float32, shape (n, 3)
+    uvd : ndarray of float32, shape (n, 3)
         Pixels and disparities as measured.
     points : ndarray of float32, shape (n, 3)
         In the `cam` frame, metres.
@@ -667,7 +629,7 @@ class KltPlace:
     """
 
     stamp_ns: int
-    pixels: NDArray[np.float32]
+    uvd: NDArray[np.float32]
     points: NDArray[np.float32]
     slopes: NDArray[np.float32]
     patches: NDArray[np.uint8]
@@ -682,24 +644,20 @@ class KltPlace:
         return self.descriptors_left, self.descriptors_wide
 
     @property
-    def uvd(self) -> FloatArray:
-        """Pixels and disparities of the corners as measured, shape (n, 3)."""
-        return self.pixels.astype(np.float64)
-
-    @property
-    def keypoints(self) -> FloatArray:
-        """Pixels (u, v) of the corners, shape (n, 2)."""
-        return self.uvd[:, :2]
-
-    @property
     def points_cam(self) -> FloatArray:
         """The corners as points in the `cam` frame, metres, shape (n, 3)."""
         return self.points.astype(np.float64)
 
-    @property
-    def templates(self) -> Templates:
-        """The patches around the corners, prepared anew."""
-        return Templates.of_patches(self.patches)
+    def unpack(self) -> KltReference:
+        """Return its corners with their patches prepared anew."""
+        corners = KltCorners(
+            uvd=self.uvd.astype(np.float64),
+            slopes=self.slopes.astype(np.float64),
+            points_cam=self.points_cam,
+            templates=Templates.of_patches(self.patches),
+            n_keypoints=len(self.uvd),
+        )
+        return KltReference(stamp_ns=self.stamp_ns, corners=corners, motion=self.motion)
 
 
 def image_of(frame: Frame) -> ImageArray:

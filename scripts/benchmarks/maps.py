@@ -92,7 +92,7 @@ class Frontend:
         points = depths * np.c_[rng.uniform((-0.6, -0.2), (0.6, 0.2), (N_POINTS, 2)), depths**0]
         return KltPlace(
             stamp_ns=number * PERIOD_NS,
-            pixels=np.zeros((N_POINTS, 3), np.float32),
+            uvd=np.zeros((N_POINTS, 3), np.float32),
             points=points.astype(np.float32),
             slopes=np.zeros((N_POINTS, 2), np.float32),
             patches=np.zeros((N_POINTS, 11, 11), np.uint8),

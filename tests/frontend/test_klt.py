@@ -57,11 +57,11 @@ def test_the_points_lie_on_the_surfaces(sensor: Sensor) -> None:
     assert seen.stamp_ns == frames(sensor)[0].stamp_ns
     assert seen.n_keypoints >= len(seen) > 150
     camera = frontend(sensor).camera
-    uvd = np.column_stack([seen.keypoints, seen.corners.disparities])
+    uvd = seen.corners.uvd
     np.testing.assert_allclose(camera.project_stereo(seen.points_cam), uvd, atol=1e-9)
     columns, rows = seen.keypoints.astype(int).T
     depth = recording(sensor).render_depth(0)[rows, columns].astype(float)
-    errors = camera.depth_to_disparity(depth) - seen.corners.disparities
+    errors = camera.depth_to_disparity(depth) - uvd[:, 2]
     assert np.median(np.abs(errors)) < (0.1 if sensor == "stereo" else 0.2)
     assert np.mean(np.abs(errors) < 1.0) > 0.85
 
