@@ -243,9 +243,7 @@ def test_what_is_refused_and_loops_tell_nothing_of_the_camera(
                 with monkeypatch.context() as patch:
                     if also == "refused":
                         patch.setattr(klt, "check_view", refuse)
-                        patch.setattr(
-                            frontend, "_check_depth", lambda _, result, *__: refuse(result)
-                        )
+                        patch.setattr(frontend, "_check_depth", refuse)
                     found = frontend.register(frames[0], current, MotionPrior(T_predicted=T))
                 assert isinstance(found, Failure) == (also == "refused")
             frontend.rig_offsets.advance()
