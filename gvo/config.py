@@ -70,6 +70,7 @@ _FIXED: Mapping[str, Value] = {
     "check.n_samples": 12,
     "depth.icp": "auto",
     "depth.virtual_baseline_m": 0.075,
+    "features.low_fast_threshold": 7,
     "klt.cell_size_px": 40,
     "klt.disparity_sigma_px": 0.15,
     "klt.max_return_px": 0.5,
@@ -91,8 +92,13 @@ _FIXED: Mapping[str, Value] = {
     "stereo.sigma_px": 0.3,
     "sync.age_penalty": 0.1,
     "sync.queue_size": 100,
+    "temporal.wide_radius_px": "four times temporal.radius_px",
+    "window.coasting_sigma_deg_per_s": 30.0,
+    "window.coasting_sigma_m_per_s": 3.0,
     "window.kernel_threshold": None,
     "window.keyframe_overlap": 0.9,
+    "window.link_gain": 2.0,
+    "window.lost_after_s": 2.0,
     "window.min_overlap": 0.4,
     "window.zero_motion": False,
     "window.zero_motion_flow_px": 1.0,
@@ -178,9 +184,6 @@ class FeaturesConfig(Section):
     n_octaves: int = _expert(1, "pyramid levels (orb)", ge=1, le=8)
     scale_factor: float = _expert(1.3, "scale factor between pyramid levels (orb)", gt=1, le=2)
     fast_threshold: int = _expert(20, "FAST threshold (orb, fast)", "grey", ge=1, le=200)
-    low_fast_threshold: int = _expert(
-        7, "FAST threshold of a second pass if the budget is not filled", "grey", ge=1, le=200
-    )
     upright: bool = _expert(
         True, "no orientation (orb, fast, gftt): more distinctive while the camera rolls little"
     )
@@ -222,9 +225,11 @@ class StereoConfig(Section):
 class TemporalConfig(Section):
     """Matching of the reference and the current frame (frontend.kind: descriptor)."""
 
-    radius_px: float = _expert(20.0, "search radius around a predicted pixel", "px", gt=0)
-    wide_radius_px: float = _expert(
-        80.0, "search radius without a prediction, or after it gave too few matches", "px", gt=0
+    radius_px: float = _expert(
+        20.0,
+        "search radius around a predicted pixel; four times as much without a prediction",
+        "px",
+        gt=0,
     )
     max_distance: float = _expert(
         0.25, "maximum descriptor distance, relative to the largest possible", gt=0, le=1
@@ -271,11 +276,6 @@ class WindowConfig(Section):
     n_links: int = _expert(
         3, "maximum registrations per frame, with its predecessor and keyframes", ge=1, le=20
     )
-    link_gain: float = _expert(
-        2.0,
-        "minimum number of steps since a keyframe was asked, times its share in view, to link it",
-        gt=0,
-    )
     keyframe_distance_m: float = _expert(
         1.0, "distance from all keyframes that makes a keyframe, if overlap is unknown", "m", gt=0
     )
@@ -285,15 +285,6 @@ class WindowConfig(Section):
     kernel: Kernel = _expert("huber", "robust kernel of the edges")
     gate: float | None = _expert(
         10.0, "maximum disagreement with most other edges of the pose; null: any", "sigma", gt=0
-    )
-    coasting_sigma_deg_per_s: float = _expert(
-        30.0, "rotation sigma of a step without registration, per second", "deg/s", gt=0
-    )
-    coasting_sigma_m_per_s: float = _expert(
-        3.0, "translation sigma of a step without registration, per second", "m/s", gt=0
-    )
-    lost_after_s: float = _expert(
-        2.0, "time without a registration until the camera is lost and a segment begins", "s", gt=0
     )
 
 

@@ -76,7 +76,7 @@ class Status(StrEnum):
     COASTING = "coasting"
     """No registration: the pose continues the last velocity, its covariance inflated."""
     LOST = "lost"
-    """Coasting for longer than `window.lost_after_s`."""
+    """Coasting for more than two seconds."""
     RESUMED = "resumed"
     """The first registered frame after coasting or lost ones."""
     SKIPPED = "skipped"

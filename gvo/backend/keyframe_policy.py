@@ -18,6 +18,9 @@ from gvo.types import FloatArray
 
 _Id = TypeVar("_Id", bound=Hashable)
 
+LINK_GAIN = 2.0
+"""Least number of steps since a keyframe was asked, times its score, at which it is linked: more
+links to the same keyframe would repeat its errors."""
 MIN_OVERLAP = 0.4
 """Least score of a keyframe that is linked: of views that share less, few corners are found."""
 KEYFRAME_OVERLAP = 0.9
@@ -64,23 +67,25 @@ def choose_links(
     *,
     n_unasked: Mapping[_Id, int],
     exclude: Hashable = None,
+    min_gain: float = LINK_GAIN,
 ) -> tuple[list[_Id], list[_Id]]:
     """Choose the keyframes to register the current frame against.
 
     A link adds what has become uncertain since the last one: the errors of steps accumulate with
     their number, and what is seen of it grows with the overlap. The product has to be at least
-    `link_gain`; the largest come first. One that could not be registered waits for its next turn.
+    `min_gain`; the largest come first. One that could not be registered waits for its next turn.
 
     Parameters
     ----------
     scores : mapping of frame to float
         Oldest first.
     config : WindowConfig
-        `n_links`, of which one goes to the predecessor, and `link_gain`.
+        `n_links`, of which one goes to the predecessor.
     n_unasked : mapping of frame to int
         Steps since each was asked last, or since it itself.
     exclude : hashable
         The predecessor.
+    min_gain : float
 
     Returns
     -------
@@ -91,14 +96,14 @@ def choose_links(
     n = config.n_links - 1
     usable = [frame for frame, score in scores.items() if score >= MIN_OVERLAP and frame != exclude]
     gains = {frame: n_unasked[frame] * scores[frame] for frame in usable}
-    telling = [frame for frame in usable if gains[frame] >= config.link_gain]
+    telling = [frame for frame in usable if gains[frame] >= min_gain]
     chosen = sorted(telling, key=lambda frame: -gains[frame])[:n]
     rest = [frame for frame in usable if frame not in chosen]
     return chosen, sorted(rest, key=lambda frame: -scores[frame])[: n - len(chosen)]
 
 
 def choose_unseen(
-    scores: Mapping[_Id, float], n_unseen: Mapping[_Id, int], n_released: int
+    scores: Mapping[_Id, float], seen_at: Mapping[_Id, int], n_released: int
 ) -> list[_Id]:
     """Choose keyframes of a map to release: those that were in view least recently.
 
@@ -109,11 +114,11 @@ def choose_unseen(
     ----------
     scores : mapping of frame to float
         Of those that may be released.
-    n_unseen : mapping of frame to int
-        Steps since each was in view.
+    seen_at : mapping of frame to int
+        Number of the step at which each was in view last.
     n_released : int
     """
-    return sorted(scores, key=lambda frame: (-n_unseen[frame], scores[frame]))[:n_released]
+    return sorted(scores, key=lambda frame: (seen_at[frame], scores[frame]))[:n_released]
 
 
 def choose_released(scores: Mapping[_Id, float], config: WindowConfig, *, n_kept: int) -> list[_Id]:

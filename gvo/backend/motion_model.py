@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from gvo.config import WindowConfig
 from gvo.geometry import se3
-from gvo.types import Edge, Estimate, FloatArray, FrameId, PosePrior, Status
+from gvo.types import Edge, Estimate, FloatArray, Status
 
+# A camera that nothing measures for longer is lost: by then nobody knows where it has gone.
+LOST_AFTER_S = 2.0
+# What may change in a second that nothing measures, rad/s and m/s: a hand turns and a car brakes by
+# as much. With smaller ones, loops to where it went would be refused.
+TURN_SIGMA, SHIFT_SIGMA = np.radians(30.0), 3.0
 # After a longer gap the last velocity is no longer extrapolated.
 MAX_EXTRAPOLATION_S = 1.0
 _MIN_ELAPSED_S = 1e-3
@@ -26,7 +30,7 @@ def velocity_of(T_last_frame: FloatArray, elapsed_s: float) -> FloatArray:
 
 
 def predict_step(
-    velocity: FloatArray | None, elapsed_s: float, config: WindowConfig, *, coasted_s: float = 0.0
+    velocity: FloatArray | None, elapsed_s: float, *, coasted_s: float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
     """Predict the next relative pose at the last velocity.
 
@@ -36,8 +40,6 @@ def predict_step(
         Twist per second (rad/s, m/s); None for zero.
     elapsed_s : float
         Seconds since the last pose.
-    config : WindowConfig
-        Sigmas per second without a measurement.
     coasted_s : float
         Seconds without a measurement before the last pose.
 
@@ -51,68 +53,63 @@ def predict_step(
     T = np.eye(4) if velocity is None else se3.exp(velocity * min(elapsed_s, MAX_EXTRAPOLATION_S))
     elapsed_s = max(elapsed_s, _MIN_ELAPSED_S)
     grown_s = np.sqrt(elapsed_s * (elapsed_s + 2.0 * coasted_s))  # (t + dt)^2 - t^2
-    turn = min(np.radians(config.coasting_sigma_deg_per_s) * grown_s, _ANY_TURN)
-    shift = min(config.coasting_sigma_m_per_s * grown_s, _ANYWHERE_M)
+    turn = min(TURN_SIGMA * grown_s, _ANY_TURN)
+    shift = min(SHIFT_SIGMA * grown_s, _ANYWHERE_M)
     return T, np.diag(np.repeat([turn, shift], 3)) ** 2
+
+
+def go_on(
+    reference: Estimate,
+    stamp_ns: int,
+    T_reference_frame: FloatArray,
+    covariance: FloatArray,
+    status: Status = Status.OK,
+) -> Estimate:
+    """Return the estimate of a frame whose pose in an earlier one is known."""
+    return Estimate(
+        stamp_ns=stamp_ns,
+        # Over a million products the rotation would lose its orthogonality.
+        T_world_frame=se3.normalize(reference.T_world_frame @ T_reference_frame),
+        covariance=se3.compose_covariance(reference.covariance, T_reference_frame, covariance),
+        status=status,
+    )
 
 
 class StatusClock:
     """Derives the status of a frame from the time without a measurement.
 
-    Parameters
-    ----------
-    lost_after_s : float
-        The camera is lost after a longer time, whether frames cannot be registered or are
-        missing.
+    The camera is lost after more than `LOST_AFTER_S`, whether frames cannot be registered or are
+    missing.
     """
 
-    def __init__(self, lost_after_s: float) -> None:
-        self.lost_after_s = lost_after_s
+    def __init__(self) -> None:
         self._measured_ns: int | None = None
         self._has_none = False
 
     def next(self, stamp_ns: int, *, is_measured: bool) -> Status:
-        """Return the status of the next frame.
-
-        Parameters
-        ----------
-        stamp_ns : int
-            Its stamp, nanoseconds.
-        is_measured : bool
-            Whether a measurement constrains it.
-        """
+        """Return the status of the next frame, which a measurement constrains or not."""
         had_none, self._has_none = self._has_none, not is_measured
         if is_measured:
             self._measured_ns = stamp_ns
             return Status.RESUMED if had_none else Status.OK
         self._measured_ns = stamp_ns if self._measured_ns is None else self._measured_ns
         coasting_s = 1e-9 * (stamp_ns - self._measured_ns)
-        return Status.LOST if coasting_s > self.lost_after_s else Status.COASTING
+        return Status.LOST if coasting_s > LOST_AFTER_S else Status.COASTING
 
 
 class ConstantVelocity:
     """The last pose, and the velocity between the last two that were measured.
 
-    Parameters
+    Attributes
     ----------
-    config : WindowConfig
-        Sigmas per second without a measurement.
+    last, measured : Estimate or None
+        The last pose, and the last one with a measurement.
     """
 
-    def __init__(self, config: WindowConfig) -> None:
-        self.config = config
-        self.restart()
-
-    def restart(self) -> None:
-        """Forget the poses so far."""
-        self._measured: Estimate | None = None
-        self._step: tuple[FloatArray, FloatArray, float] | None = None
+    def __init__(self) -> None:
         self.last: Estimate | None = None
-
-    @property
-    def measured_id(self) -> FrameId:
-        """The last frame with a measurement; None before the first."""
-        return None if self._measured is None else self._measured.frame_id
+        self.measured: Estimate | None = None
+        self._velocity: FloatArray | None = None
 
     def append(
         self, estimate: Estimate, *, is_measured: bool, T_world_measured: FloatArray | None = None
@@ -125,27 +122,26 @@ class ConstantVelocity:
         is_measured : bool
             Whether a measurement constrains it.
         T_world_measured : ndarray of float64, shape (4, 4), optional
-            Current pose of `measured_id` in the same graph: its causal estimate would make a
+            Current pose of `measured` in the same graph: its causal estimate would make a
             correction look like a motion. The velocity is unknown without it.
         """
         self.last = estimate
         if not is_measured:
             return
-        self._step = None
-        if self._measured is not None and T_world_measured is not None:
-            elapsed_s = 1e-9 * (estimate.stamp_ns - self._measured.stamp_ns)
-            self._step = T_world_measured, estimate.T_world_frame, elapsed_s
-        self._measured = estimate
+        former, self.measured, self._velocity = self.measured, estimate, None
+        if former is not None and T_world_measured is not None:
+            T_measured_frame = se3.invert(T_world_measured) @ estimate.T_world_frame
+            elapsed_s = 1e-9 * (estimate.stamp_ns - former.stamp_ns)
+            self._velocity = velocity_of(T_measured_frame, elapsed_s)
 
     def predict(self, stamp_ns: int) -> Edge | None:
         """Return the edge from the last frame to a later one; None without a last one."""
         if self.last is None:
             return None
-        measured_ns = (self._measured or self.last).stamp_ns
+        measured_ns = (self.measured or self.last).stamp_ns
         T_last_frame, covariance = predict_step(
-            self._velocity(),
+            self._velocity,
             1e-9 * (stamp_ns - self.last.stamp_ns),
-            self.config,
             coasted_s=1e-9 * (self.last.stamp_ns - measured_ns),
         )
         return Edge(
@@ -155,19 +151,9 @@ class ConstantVelocity:
             kernel="none",
         )
 
-    def predict_pose(self, stamp_ns: int) -> PosePrior | None:
+    def predict_pose(self, stamp_ns: int) -> Estimate | None:
         """Return where a later frame is in the world; None without a last one."""
         if self.last is None or (edge := self.predict(stamp_ns)) is None:
             return None
-        T = edge.T_reference_frame
-        return PosePrior(
-            T_world_frame=se3.normalize(self.last.T_world_frame @ T),
-            covariance=se3.compose_covariance(self.last.covariance, T, edge.covariance),
-        )
-
-    def _velocity(self) -> FloatArray | None:
-        """Return the twist per second; None if unknown."""
-        if self._step is None:
-            return None
-        T_world_before, T_world_last, elapsed_s = self._step
-        return velocity_of(se3.invert(T_world_before) @ T_world_last, elapsed_s)
+        step = edge.T_reference_frame, edge.covariance
+        return go_on(self.last, stamp_ns, *step, status=Status.COASTING)

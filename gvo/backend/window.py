@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
@@ -131,8 +131,8 @@ class SlidingWindow:
         self._poses = self._graph.poses
         self._counted: Counter[str] = Counter()
         self._first_rejected = ""
-        self._clock = StatusClock(self._config.lost_after_s)
-        self._motion = ConstantVelocity(self._config)
+        self._clock = StatusClock()
+        self._motion = ConstantVelocity()
         self._batch_result: BatchResult | None = None
         self.variance_factor = 1.0
         self.misfit = math.nan
@@ -189,8 +189,6 @@ class SlidingWindow:
             return
         self._config = config
         self._graph.reconfigure(config)
-        self._clock.lost_after_s = config.lost_after_s
-        self._motion.config = config
 
     def add_pose(
         self,
@@ -305,9 +303,10 @@ class SlidingWindow:
         self._graph.require(frame_id)
         return self._graph.pose(frame_id)
 
-    def poses(self) -> dict[FrameId, FloatArray]:
-        """Return T_world_frame of all poses of the window, oldest first."""
-        return {frame_id: self._graph.pose(frame_id) for frame_id in self._poses}
+    def poses(self, frame_ids: Iterable[FrameId] | None = None) -> dict[FrameId, FloatArray]:
+        """Return T_world_frame of all poses of the window, oldest first, or of some frames."""
+        asked = self._poses if frame_ids is None else frame_ids
+        return {each: self._graph.pose(each) for each in asked if each in self._poses}
 
     def edges(self, frame_id: FrameId) -> tuple[Edge, ...]:
         """Return the accepted edges of a frame to poses of the window; empty if it has left."""
@@ -385,8 +384,8 @@ class SlidingWindow:
         A window that kept all poses from the start (`size: null`) is optimized in a batch first.
         """
         self._batch_result = self._graph.finish()
-        self._motion.restart()
-        self._clock = StatusClock(self._config.lost_after_s)
+        self._motion = ConstantVelocity()
+        self._clock = StatusClock()
         return sorted(self.pop_finished(), key=lambda estimate: estimate.stamp_ns)
 
     # What comes in
@@ -512,7 +511,8 @@ class SlidingWindow:
     def _support(self, stamp_ns: int, prior: PositionPrior | None) -> PosePrior:
         """Return where a pose begins that no pose of the window leads to."""
         if (predicted := self._motion.predict_pose(stamp_ns)) is not None:
-            return predicted
+            T, covariance = predicted.T_world_frame, predicted.covariance
+            return PosePrior(T_world_frame=T, covariance=covariance)
         if prior is None:
             return ORIGIN
         T_world_start = se3.make_transform(np.eye(3), prior.position_world)
@@ -584,13 +584,10 @@ class SlidingWindow:
 
     def _update_motion(self, new: NewPose, estimate: Estimate) -> None:
         """Update the velocity if edges, and not a prior alone, say how the camera moved."""
-        measured_id = self._motion.measured_id
-        is_known = bool(new.measurements) and measured_id in self._poses
-        self._motion.append(
-            estimate,
-            is_measured=new.is_measured,
-            T_world_measured=self._graph.pose(measured_id) if is_known else None,
-        )
+        before, T_world_before = self._motion.measured, None
+        if new.measurements and before is not None and before.frame_id in self._poses:
+            T_world_before = self._graph.pose(before.frame_id)
+        self._motion.append(estimate, is_measured=new.is_measured, T_world_measured=T_world_before)
 
     def _keep_by_distance(self, frame_id: FrameId) -> None:
         T_frame_world = se3.invert(self.pose(frame_id))

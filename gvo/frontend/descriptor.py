@@ -36,6 +36,8 @@ _DISPARITY_SIGMA_PX = 0.3
 _SIGMA_FACTOR = 1.2
 # An RGB-D camera is treated as a stereo camera of this baseline, that of a Kinect.
 _VIRTUAL_BASELINE_M = 0.075
+# Without a prediction, or after it gave too few matches, the search is as many times wider.
+WIDE = 4.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -252,7 +254,7 @@ class DescriptorFrontend:
             note_step(reference, current, T_predicted)
         predicted = predict_pixels(reference, T_predicted, self.camera)
         config = self._config.temporal
-        radius_px = config.wide_radius_px if is_wide else config.radius_px
+        radius_px = (WIDE if is_wide else 1.0) * config.radius_px
         matches = match_temporal(reference, current, predicted, config, radius_px=radius_px)
         measured = Correspondences.of(reference, current, matches)
         return Measurements(

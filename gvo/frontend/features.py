@@ -33,6 +33,9 @@ Descriptors = NDArray[np.uint8] | NDArray[np.float32]
 
 # Border that the descriptors' patch needs (31 px with its rotation), at the first octave.
 _BORDER_PX = 19
+# FAST's threshold of a second pass over images whose budget the first one does not fill, grey:
+# lower, corners are noise.
+_LOW_FAST_THRESHOLD = 7
 # Ratio of candidates to the budget. ORB limits its candidates by strength over the whole image, and
 # a tight limit drops those on the road: near points, which carry the translation.
 _N_CANDIDATES = 8
@@ -137,7 +140,7 @@ def _make_detectors(config: FeaturesConfig, orb: cv2.Feature2D) -> list[cv2.Feat
                 maxCorners=n_candidates, qualityLevel=0.001, minDistance=3
             )
         ]
-    low = min(config.low_fast_threshold, config.fast_threshold)
+    low = min(_LOW_FAST_THRESHOLD, config.fast_threshold)
     if config.kind == "fast":
         return [
             cv2.FastFeatureDetector_create(threshold=threshold)  # type: ignore[attr-defined]

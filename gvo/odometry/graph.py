@@ -20,12 +20,11 @@ import numpy as np
 
 from gvo.backend.batch import INLIER_CHI2, BatchOptimizer, WholeGraph
 from gvo.backend.factors import ORIGIN
-from gvo.config import WindowConfig
+from gvo.backend.motion_model import SHIFT_SIGMA, TURN_SIGMA
 from gvo.errors import SmoothingError
 from gvo.geometry import se3
 from gvo.geometry.edges import chi2, fuse, inverse, then
-from gvo.odometry.parts import Parts
-from gvo.odometry.path import Path, Way, Ways, bent, source_ns
+from gvo.odometry.path import Parts, Path, Way, Ways, bent, source_ns
 from gvo.types import Edge, Estimate, FloatArray, Loop, Optimum, PosePrior
 
 _LOGGER = logging.getLogger(__name__)
@@ -54,10 +53,6 @@ class RunGraph:
 
     Parameters
     ----------
-    config : WindowConfig
-        Sigmas of steps that were not measured.
-    parts : Parts, optional
-        Of the frames, where others have to know them, too.
     max_frames : int
         Of the graph: beyond so many, those that are no places are merged, oldest first.
 
@@ -73,11 +68,9 @@ class RunGraph:
         The correction of the newest poses by loops, as last optimized while the run goes.
     """
 
-    def __init__(
-        self, config: WindowConfig, parts: Parts | None = None, *, max_frames: int = 3000
-    ) -> None:
-        self._config, self._max_frames = config, max_frames
-        self.path, self.parts = Path(), parts or Parts()
+    def __init__(self, *, max_frames: int = 3000) -> None:
+        self._max_frames = max_frames
+        self.path, self.parts = Path(), Parts()
         # By the stamps of both ends, the earlier one first; and which frames are tied to which.
         self._edges: dict[tuple[int, int], list[Edge]] = {}
         self._neighbours: dict[int, set[int]] = {}
@@ -89,10 +82,6 @@ class RunGraph:
         self._running: Future[_Verdict] | None = None
         self._n_keyframes = self._next = self._due = 0
         self._is_due = False
-
-    def reconfigure(self, config: WindowConfig) -> None:
-        """Use another configuration from now on."""
-        self._config = config
 
     def __len__(self) -> int:
         """Return the number of frames that were not merged."""
@@ -131,9 +120,8 @@ class RunGraph:
 
     def allows(self, loop: Loop) -> bool:
         """Tell whether a loop leads where odometry, and what was guessed in the dark, allow it."""
-        if not self._is_known(loop):
-            return True
-        return _is_allowed(loop, self.path.way(loop.reference_ns, loop.stamp_ns))
+        way = self.path.way(loop.reference_ns, loop.stamp_ns) if self._is_known(loop) else None
+        return way is None or _is_allowed(loop, way)
 
     def _is_known(self, loop: Loop) -> bool:
         return loop.stamp_ns in self.path and loop.reference_ns in self.path
@@ -147,11 +135,11 @@ class RunGraph:
         T_last_frame = se3.invert(self.path.pose(last_ns)) @ estimate.T_world_frame
         velocity = se3.log(T_last_frame).reshape(2, 3) / elapsed_s
         turn, speed = _HALT * np.linalg.norm(velocity, axis=1)
-        config, variances = self._config, []
+        variances = []
         for stamp_ns in (last_ns, estimate.stamp_ns):
             t = 1e-9 * (stamp_ns - self._measured_ns)
-            turns = np.radians(config.coasting_sigma_deg_per_s) * t, turn * t
-            shifts = config.coasting_sigma_m_per_s * t * min(t / _STEADY_S, 1.0), speed * t
+            turns = TURN_SIGMA * t, turn * t
+            shifts = SHIFT_SIGMA * t * min(t / _STEADY_S, 1.0), speed * t
             sigmas = np.repeat([np.hypot(*turns), np.hypot(*shifts)], 3)
             variances.append(np.minimum(sigmas, _GUESS_SIGMAS) ** 2)
         return np.diag(variances[1] - variances[0])
@@ -275,7 +263,7 @@ class RunGraph:
             If GTSAM fails, the graph is empty, or no valid edge leads to a frame.
         """
         if len(self.path) == 0:
-            raise SmoothingError("the graph of the run is empty: no frame has come (loops.enabled)")
+            raise SmoothingError("the graph of the run is empty: no frame has come")
         ways = self.path.ways()
         reasons = self._reasons(self.loops, ways)
         loops = tuple(

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg.lapack import dposv
 
 from gvo.backend.gating import disagreement
-from gvo.backend.keyframe_policy import MIN_OVERLAP, choose_links, proximity
+from gvo.backend.keyframe_policy import LINK_GAIN, MIN_OVERLAP, choose_links, proximity
 from gvo.backend.window import SlidingWindow
 from gvo.config import WindowConfig
 from gvo.frontend.protocol import HasPoints, ObservationsT
@@ -27,12 +27,29 @@ _N_SAMPLES = 64
 _MAX_ZOOM = 1.6
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Keyframe(Generic[ObservationsT]):
-    """A kept frame, and a sample of its points."""
+@dataclass(slots=True, kw_only=True, eq=False)
+class Keyframe(Generic[ObservationsT]):
+    """A kept frame.
+
+    Parameters
+    ----------
+    observations
+    points_cam : ndarray of float64, shape (64, 3), or None
+        A sample of its points, metres; None where the front-end tells none.
+    asked_at, seen_at : int
+        Numbers of steps at which it was asked for a link last, and in view last.
+    is_linked : bool
+        Its last registration succeeded.
+    start : Estimate or None
+        By the raw chain, if that was not broken since.
+    """
 
     observations: ObservationsT
     points_cam: FloatArray | None
+    asked_at: int
+    seen_at: int
+    is_linked: bool = True
+    start: Estimate | None = None
 
 
 class Keyframes(Generic[ObservationsT]):
@@ -46,122 +63,86 @@ class Keyframes(Generic[ObservationsT]):
     camera : StereoCamera or None
     config : WindowConfig
         Distance and angle of the proximity.
+
+    Attributes
+    ----------
+    kept : dict of int to Keyframe
+        By stamp, oldest first.
     """
 
     def __init__(self, camera: StereoCamera | None, config: WindowConfig) -> None:
-        self._camera, self._config = camera, config
-        self._kept: dict[int, _Keyframe[ObservationsT]] = {}
-        # Those whose last registration failed.
-        self._unlinked: set[int] = set()
-        # Numbers of steps at which keyframes were asked for a link last, and in view last.
-        self._asked_at: dict[int, int] = {}
-        self._seen_at: dict[int, int] = {}
+        self.camera, self.config = camera, config
+        self.kept: dict[int, Keyframe[ObservationsT]] = {}
 
-    @property
-    def stamps_ns(self) -> list[int]:
-        """Stamps of the kept frames, oldest first."""
-        return list(self._kept)
+    def __contains__(self, stamp_ns: object) -> bool:
+        """Tell whether a frame is kept."""
+        return stamp_ns in self.kept
 
-    def __getitem__(self, stamp_ns: int) -> ObservationsT:
-        """Return the observations of a kept frame."""
-        return self._kept[stamp_ns].observations
-
-    def __len__(self) -> int:
-        """Return the number of kept frames."""
-        return len(self._kept)
-
-    def n_unasked(self, n_steps: int) -> dict[int, int]:
-        """Return the number of steps since each keyframe was asked for a link, or kept."""
-        return {stamp_ns: n_steps - asked_at for stamp_ns, asked_at in self._asked_at.items()}
-
-    def note_attempt(self, stamp_ns: int, n_steps: int, *, is_linked: bool) -> None:
-        """Remember that a keyframe was asked for a link, and whether it gave one."""
-        self._asked_at[stamp_ns] = n_steps
-        if is_linked:
-            self._unlinked.discard(stamp_ns)
-        else:
-            self._unlinked.add(stamp_ns)
-
-    def registrable(self, scores: Mapping[int, float]) -> dict[int, float]:
-        """Return the scores without keyframes whose last registration failed."""
-        return {ns: score for ns, score in scores.items() if ns not in self._unlinked}
-
-    def note_seen(self, scores: Mapping[int, float], n_steps: int) -> None:
-        """Remember which keyframes are in view of the current frame."""
-        for stamp_ns, score in scores.items():
-            if score >= MIN_OVERLAP:
-                self._seen_at[stamp_ns] = n_steps
-
-    def n_unseen(self, n_steps: int) -> dict[int, int]:
-        """Return the number of steps since each keyframe was in view."""
-        return {stamp_ns: n_steps - seen_at for stamp_ns, seen_at in self._seen_at.items()}
-
-    def reconfigure(self, camera: StereoCamera | None, config: WindowConfig) -> None:
-        """Score with another camera or configuration from now on; what is kept stays."""
-        self._camera, self._config = camera, config
-
-    def add(self, observations: ObservationsT, *, n_steps: int = 0) -> None:
+    def add(
+        self, observations: ObservationsT, *, n_steps: int = 0, start: Estimate | None = None
+    ) -> None:
         """Keep a frame."""
         points = observations.points_cam if isinstance(observations, HasPoints) else None
-        self._kept[observations.stamp_ns] = _Keyframe(
-            observations=observations, points_cam=None if points is None else _sample_points(points)
+        self.kept[observations.stamp_ns] = Keyframe(
+            observations=observations,
+            points_cam=None if points is None else _sample_points(points),
+            asked_at=n_steps,
+            seen_at=n_steps,
+            start=start,
         )
-        self._asked_at[observations.stamp_ns] = self._seen_at[observations.stamp_ns] = n_steps
 
-    def replace(self, observations: ObservationsT) -> None:
-        """Keep other observations of a frame that is kept already."""
-        self.add(observations, n_steps=self._asked_at[observations.stamp_ns])
-
-    def drop(self, stamp_ns: int) -> None:
-        """Forget a kept frame."""
-        del self._kept[stamp_ns]
-        del self._asked_at[stamp_ns], self._seen_at[stamp_ns]
-        self._unlinked.discard(stamp_ns)
-
-    def scores(self, T_current_keyframe: Mapping[int, FloatArray]) -> dict[int, float]:
+    def scores(
+        self, T_current_keyframes: Mapping[int, FloatArray], n_steps: int
+    ) -> dict[int, float]:
         """Return how much the current frame has in common with keyframes, 0 to 1.
 
         Parameters
         ----------
-        T_current_keyframe : mapping of int to ndarray of float64, shape (4, 4)
+        T_current_keyframes : mapping of int to ndarray of float64, shape (4, 4)
             By stamp of the keyframe.
+        n_steps : int
+            The present step, at which those that have enough in common are in view.
         """
-        kept = [self._kept[stamp_ns].points_cam for stamp_ns in T_current_keyframe]
-        samples = [points for points in kept if points is not None]
-        is_uniform = len(samples) == len(kept) and len({*map(len, samples)}) == 1
-        # Samples of one size, as of most frames, are looked at together.
-        if is_uniform and self._camera is not None:
-            poses = np.stack(list(T_current_keyframe.values()))
-            overlaps = view_overlaps(np.stack(samples), poses, self._camera)
-            return dict(zip(T_current_keyframe, overlaps.tolist(), strict=True))
-        return {stamp_ns: self._score(stamp_ns, T) for stamp_ns, T in T_current_keyframe.items()}
-
-    def _score(self, stamp_ns: int, T_current_keyframe: FloatArray) -> float:
-        points = self._kept[stamp_ns].points_cam
-        if points is None or self._camera is None:
-            return proximity(T_current_keyframe, self._config)
-        return view_overlap(points, T_current_keyframe, self._camera)
+        if not T_current_keyframes:
+            return {}
+        poses = list(T_current_keyframes.values())
+        samples = [self.kept[stamp_ns].points_cam for stamp_ns in T_current_keyframes]
+        known = [points for points in samples if points is not None]
+        if self.camera is None or len(known) < len(samples):
+            found = [proximity(T, self.config) for T in poses]
+        else:
+            found = view_overlap(np.stack(known), np.stack(poses), self.camera).tolist()
+        scores = dict(zip(T_current_keyframes, found, strict=True))
+        for stamp_ns, score in scores.items():
+            if score >= MIN_OVERLAP:
+                self.kept[stamp_ns].seen_at = n_steps
+        return scores
 
 
 def _sample_points(points_cam: FloatArray) -> FloatArray:
-    """Subsample at most 64 points of shape (n, 3)."""
-    n = len(points_cam)
-    chosen = np.linspace(0, n - 1, min(_N_SAMPLES, n))
-    return points_cam[chosen.astype(np.int64)]
+    """Return 64 of the points (n, 3), some of them twice if they are fewer."""
+    if len(points_cam) == 0:
+        return np.full((_N_SAMPLES, 3), np.nan)  # never in view
+    return points_cam[np.linspace(0, len(points_cam) - 1, _N_SAMPLES).astype(np.int64)]
 
 
 def view_overlap(
     points_keyframe: FloatArray, T_current_keyframe: FloatArray, camera: StereoCamera
-) -> float:
-    """Return the share of points (n, 3) in view of another camera, at about the same distance."""
-    return float(view_overlaps(points_keyframe, T_current_keyframe, camera))
-
-
-def view_overlaps(
-    points_keyframes: FloatArray, T_current_keyframes: FloatArray, camera: StereoCamera
 ) -> FloatArray:
-    """Return these shares, shape (...), of points (..., n, 3) by poses (..., 4, 4)."""
-    T, points = T_current_keyframes, np.swapaxes(points_keyframes, -1, -2)
+    """Return which share of points is in view of another camera, at about the same distance.
+
+    Parameters
+    ----------
+    points_keyframe : ndarray of float64, shape (..., n, 3)
+        In the keyframe, metres.
+    T_current_keyframe : ndarray of float64, shape (..., 4, 4)
+    camera : StereoCamera
+
+    Returns
+    -------
+    ndarray of float64, shape (...)
+    """
+    T, points = T_current_keyframe, np.swapaxes(points_keyframe, -1, -2)
     moved = T[..., :3, :3] @ points + T[..., :3, 3:]
     x, y, z = moved[..., 0, :], moved[..., 1, :], moved[..., 2, :]
     zoom = z / points[..., 2, :]
@@ -181,6 +162,7 @@ def link_keyframes(
     config: WindowConfig,
     *,
     n_unasked: Mapping[int, int],
+    min_gain: float = LINK_GAIN,
 ) -> list[Edge]:
     """Register a frame against the keyframes that add information to its steps.
 
@@ -200,10 +182,15 @@ def link_keyframes(
         Of the frame.
     config : WindowConfig
     n_unasked : mapping of int to int
-        See `Keyframes.n_unasked`.
+        Steps since each keyframe was asked for a link, or kept.
+    min_gain : float
+        See `choose_links`.
     """
-    chosen, spare = choose_links(scores, config, n_unasked=n_unasked, exclude=step.reference_ns)
-    if not chosen and step.is_registered and step.is_steady:
+    before_ns = None if step.edge is None else step.edge.reference_id
+    chosen, spare = choose_links(
+        scores, config, n_unasked=n_unasked, exclude=before_ns, min_gain=min_gain
+    )
+    if not chosen and step.failure is None and step.is_steady:
         spare = []
     links: list[Edge] = []
     is_confirmed = False
@@ -226,26 +213,16 @@ def _confirms(
     The drift of the window's poses counts against the step too: then another keyframe is tried
     in vain, which is better than one not tried.
     """
-    if not step.is_registered:
+    if step.edge is None or step.failure is not None:
         return False
-    gate = config.gate
-    return gate is None or not disagreement(link, T_keyframe_frame, step.covariance, gate=gate)
+    gate, covariance = config.gate, step.edge.covariance
+    return gate is None or not disagreement(link, T_keyframe_frame, covariance, gate=gate)
 
 
 def judge_links(
     offered: Sequence[tuple[LinkKind, Edge]], frame_id: int, window: SlidingWindow
 ) -> tuple[FrameLink, ...]:
-    """Compare the edges of the newest frame with the poses of the window.
-
-    Parameters
-    ----------
-    offered : sequence of (kind, Edge)
-        As they were offered to the window; frames are named by their stamps.
-    frame_id : int
-        The newest frame.
-    window : SlidingWindow
-        After it took the frame.
-    """
+    """Compare the edges of the newest frame, as they were offered, with the poses of the window."""
     accepted = {id(edge) for edge in window.edges(frame_id)}
     is_there = frame_id in window
     return tuple(

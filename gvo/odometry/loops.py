@@ -270,7 +270,8 @@ class LoopDetector:
     def _shows(self, T_world_frame: FloatArray, visit: _Visit) -> bool:
         """Tell whether a frame shows most of a place, by odometry."""
         T = se3.invert(T_world_frame) @ self._pose(visit)
-        return view_overlap(visit.place.points_cam, T, self._frontend.camera) > _MAX_OVERLAP
+        overlap = view_overlap(visit.place.points_cam, T, self._frontend.camera)
+        return float(overlap) > _MAX_OVERLAP
 
     def _elsewhere(self, scores: FloatArray) -> list[_Visit]:
         """Return the places of other parts that a view is most like."""

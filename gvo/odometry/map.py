@@ -13,7 +13,6 @@ from gvo.odometry.chain import RawStep
 from gvo.odometry.graph import RunGraph
 from gvo.odometry.keyframes import Keyframes
 from gvo.odometry.loops import LoopDetector
-from gvo.odometry.parts import Parts
 from gvo.odometry.path import source_ns
 from gvo.types import Edge, Estimate, FloatArray, Loop, SegmentJoin, Status
 
@@ -22,8 +21,8 @@ class Map(Generic[ObservationsT]):
     """Finds places again: after a gap, so that the window goes on there, and to close loops.
 
     After a gap the frames are a part by themselves, whose place among the others is a guess. It is
-    known again when something measured connects both, see `search`. Without loops, only what the
-    window holds when a gap begins is kept, until then.
+    known again when something measured connects both, see `search`. Without loops, only the
+    keyframes that the window holds when a gap begins are places, until then.
 
     Parameters
     ----------
@@ -36,6 +35,8 @@ class Map(Generic[ObservationsT]):
     Attributes
     ----------
     graph : RunGraph
+    unjoined_ns : list of int
+        The keyframes that nothing measured connects with the latest frames.
     segment : int
         The number of the part that the latest measured frame is in.
     variance_factor : float
@@ -49,33 +50,30 @@ class Map(Generic[ObservationsT]):
         window: SlidingWindow,
         keyframes: Keyframes[ObservationsT],
     ) -> None:
-        self._config, self._recognizer = config, recognizer
         self._window, self._keyframes = window, keyframes
-        self._parts = Parts()
+        self.graph = RunGraph()
+        self.unjoined_ns: list[int] = []
         # By the first frame of a part: its number. Only those that frames were registered in.
         self._numbers: dict[int, int] = {}
-        self.segment = self._n_segments = 0
-        self._part = 0
+        self.segment = self._n_segments = self._part = 0
         # The gap before the current part was too long to go on from a guess.
         self._is_lost = False
         self.variance_factor = 1.0
-        self._begin()
-
-    def _begin(self) -> None:
-        self.graph = RunGraph(self._config.window, self._parts)
-        self._detector = None
-        if self._recognizer is not None:
-            self._detector = LoopDetector(frontend=self._recognizer, graph=self.graph)
-            self.graph.loops = self._detector.loops
+        self._detector: LoopDetector | None = None
+        self._is_enabled = False
+        self.reconfigure(config, recognizer)
 
     def reconfigure(self, config: Config, recognizer: Recognizer | None) -> None:
-        """Go on with another configuration or front-end; without loops before, the map begins."""
-        former, self._config, self._recognizer = self._config, config, recognizer
-        self.graph.reconfigure(config.window)
-        if not former.loops.enabled:
-            self._begin()
-        elif self._detector is not None and recognizer is not None:
+        """Go on with another configuration or front-end; places are kept with loops alone."""
+        was_enabled, self._is_enabled = self._is_enabled, config.loops.enabled
+        if recognizer is None:
+            self._detector = None
+        elif self._detector is None or not was_enabled:
+            self._detector = LoopDetector(frontend=recognizer, graph=self.graph)
+        else:
             self._detector.reconfigure(recognizer)
+        if self._detector is not None and self._is_enabled:
+            self.graph.loops = self._detector.loops
 
     def forget_places(self) -> None:
         """Search no more places that another front-end has described."""
@@ -85,23 +83,22 @@ class Map(Generic[ObservationsT]):
     @property
     def seeks_places(self) -> bool:
         """Tell whether a lost camera looks for places itself."""
-        return self._detector is not None and self._config.loops.enabled
-
-    @property
-    def unjoined_ns(self) -> list[int]:
-        """The keyframes that nothing measured connects with the latest frames."""
-        kept_ns = (ns for ns in self._keyframes.stamps_ns if ns in self._parts)
-        return [ns for ns in kept_ns if self._parts.of(ns) != self._part]
+        return self._detector is not None and self._is_enabled
 
     @property
     def hidden_ns(self) -> list[int]:
-        """Those of them that the guess is too bad for to be registered from it."""
+        """The unjoined keyframes that the guess is too bad for to be registered from it."""
         return self.unjoined_ns if self._is_lost else []
 
     def follow(self, step: RawStep) -> None:
         """Note that the next frame goes on in the part that its step starts from."""
-        if step.reference_ns is not None:
-            self._part = self._parts.of(step.reference_ns)
+        if step.edge is not None:
+            self._note_unjoined(source_ns(step.edge))
+
+    def _note_unjoined(self, stamp_ns: int) -> None:
+        self._part = self.graph.parts.of(stamp_ns)
+        kept_ns, parts = self._keyframes.kept, self.graph.parts
+        self.unjoined_ns = [ns for ns in kept_ns if ns in parts and parts.of(ns) != self._part]
 
     def search(
         self,
@@ -120,48 +117,34 @@ class Map(Generic[ObservationsT]):
         tuple of Loop, or None
             The loops that are confirmed, see `joining`; None if nobody had to look.
         """
-        unjoined_ns, reference_ns = self.unjoined_ns, step.reference_ns
-        is_linked = any(edge.reference_id in unjoined_ns for edge in links)
-        if (
-            step.registration is None
-            or not unjoined_ns
-            or is_linked
-            or reference_ns not in self._window
-        ):
+        is_linked = any(edge.reference_id in self.unjoined_ns for edge in links)
+        if step.edge is None or step.failure is not None or not self.unjoined_ns or is_linked:
             return None
-        if not self._config.loops.enabled and len(self.graph.path) == 0:
-            self._begin_with_window()
-        T_world_frame = self._window.pose(reference_ns) @ step.T_reference_frame
-        return self._look(observations, T_world_frame, is_keyframe=is_keyframe)
-
-    def _begin_with_window(self) -> None:
-        """Begin a map with what the window holds."""
-        for ns in self._window.poses():
-            stamp_ns = int(ns)  # type: ignore[call-overload]
-            edges = self._window.edges(stamp_ns)
-            self.graph.add_frame(self._window.estimate(stamp_ns), edges, is_place=True)
-        if self._detector is not None:
+        if not self._is_enabled and self._detector is not None and len(self._detector) == 0:
             for stamp_ns in self.unjoined_ns:
-                self._detector.keep(self._keyframes[stamp_ns], self._window.pose(stamp_ns))
+                observed = self._keyframes.kept[stamp_ns].observations
+                self._detector.keep(observed, self._window.pose(stamp_ns))
+        T_world_frame = self._window.pose(step.edge.reference_id) @ step.edge.T_reference_frame
+        return self._look(observations, T_world_frame, is_keyframe=is_keyframe)
 
     def joining(self, loops: Sequence[Loop] | None) -> Edge | None:
         """Return the edge that confirmed loops give to a keyframe of another part in the window."""
         if not loops:
             return None
-        loop, path, there = loops[-1], self.graph.path, self._parts.of(loops[-1].reference_ns)
-        kept = [ns for ns in self.unjoined_ns if ns in self._window and self._parts.of(ns) == there]
+        loop, reference_ns, parts = loops[-1], loops[-1].reference_ns, self.graph.parts
+        there = parts.of(reference_ns)
+        kept = [ns for ns in self.unjoined_ns if ns in self._window and parts.of(ns) == there]
         if not kept:
             return None
-        reference_ns = loop.reference_ns
         nearest = min(kept, key=lambda ns: abs(ns - reference_ns))
         if nearest == reference_ns:
             return loop.edge
-        ends = sorted((nearest, reference_ns))
-        way = path.way(*ends)
+        first, last = sorted((nearest, reference_ns))
+        way = self.graph.path.way(first, last)
         between = Edge(
-            reference_id=ends[0], T_reference_frame=way.T, covariance=way.covariance + way.drift
+            reference_id=first, T_reference_frame=way.T, covariance=way.covariance + way.drift
         )
-        return then(between if nearest < reference_ns else inverse(between, nearest), loop.edge)
+        return then(between if first == nearest else inverse(between, nearest), loop.edge)
 
     def add(
         self,
@@ -182,27 +165,25 @@ class Map(Generic[ObservationsT]):
         anchor : observations, optional
             Of the last registered frame.
         """
-        stamp_ns, is_enabled = causal.stamp_ns, self._config.loops.enabled
-        edges, is_tied = self._window.edges(stamp_ns), causal.status in (Status.OK, Status.RESUMED)
-        before = {self._parts.of(source_ns(edge)): edge for edge in edges}
+        stamp_ns, edges = causal.stamp_ns, self._window.edges(causal.stamp_ns)
+        before = {self.graph.parts.of(source_ns(edge)): edge for edge in edges}
         self._part = min(before, default=stamp_ns)
-        is_keyframe, loops = stamp_ns in self._keyframes.stamps_ns, found
-        if is_enabled and loops is None and is_tied:
+        is_tied = causal.status in (Status.OK, Status.RESUMED)
+        is_keyframe, loops = stamp_ns in self._keyframes, found
+        if self._is_enabled and loops is None and is_tied:
             loops = self._look(observations, causal.T_world_frame, is_keyframe=is_keyframe)
         is_place = self._detector is not None and stamp_ns in self._detector
-        if is_enabled or len(self.graph.path) > 0:
-            self.graph.add_frame(causal, edges, is_place=is_place)
-        self._parts.add(stamp_ns, before)
-        if not edges:
+        self.graph.add_frame(causal, edges, is_place=is_place)
+        if not edges and anchor is not None:
             self._keep_last_seen(anchor)
+        if self._is_lost or not self._is_enabled:
+            self._note_unjoined(stamp_ns)
         self._is_lost = causal.status is Status.LOST or (self._is_lost and bool(self.unjoined_ns))
-        if not is_enabled:
-            if not self.unjoined_ns and len(self.graph.path) > 0:
-                self._begin()
-            loops = ()
-        elif is_keyframe or is_place:
+        if self._is_enabled and (is_keyframe or is_place):
             self.graph.advance(is_looped=bool(loops))
-        return self._note_joins(stamp_ns, before), loops or ()
+        if not self._is_enabled and not self.unjoined_ns:
+            self.forget_places()
+        return self._note_joins(stamp_ns, before), loops or () if self._is_enabled else ()
 
     def _note_joins(self, stamp_ns: int, before: Mapping[int, Edge]) -> tuple[SegmentJoin, ...]:
         """Return which segments a frame joins; number its part, where it begins one."""
@@ -235,16 +216,15 @@ class Map(Generic[ObservationsT]):
         return self._detector.look(
             observations,
             T_world_frame,
-            near=set(self._keyframes.stamps_ns).difference(self.unjoined_ns),
+            near=self._keyframes.kept.keys() - set(self.unjoined_ns),
             part=self._part,
             is_keyframe=is_keyframe,
         )
 
-    def _keep_last_seen(self, anchor: ObservationsT | None) -> None:
+    def _keep_last_seen(self, anchor: ObservationsT) -> None:
         """Make the last registered frame a place: it is what a lost camera may see again."""
-        if self._detector is None or anchor is None:
+        stamp_ns, detector = anchor.stamp_ns, self._detector
+        if detector is None or not self._is_enabled or stamp_ns in detector:
             return
-        stamp_ns = anchor.stamp_ns
-        is_there = stamp_ns in self.graph.path and stamp_ns in self._window
-        if is_there and stamp_ns not in self._detector:
-            self._detector.keep(anchor, self._window.pose(stamp_ns))
+        if stamp_ns in self._window:
+            detector.keep(anchor, self._window.pose(stamp_ns))

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from gvo.backend.keyframe_policy import choose_unseen, is_needed
+from gvo.backend.keyframe_policy import LINK_GAIN, choose_unseen, is_needed
 from gvo.backend.window import SlidingWindow
 from gvo.config import Config
 from gvo.frontend.depth_icp import DepthTrust
@@ -25,6 +25,7 @@ from gvo.odometry.chain import RawChain, RawStep
 from gvo.odometry.graph import RunGraph
 from gvo.odometry.keyframes import Keyframes, judge_links, link_keyframes, misclosure
 from gvo.odometry.map import Map
+from gvo.odometry.path import source_ns
 from gvo.types import (
     Edge,
     Estimate,
@@ -86,6 +87,12 @@ class Odometry:
     frontend : Frontend, optional
         Any object with `extract` and `register`, in place of what `frontend.kind` names.
 
+    Attributes
+    ----------
+    link_gain : float
+        A keyframe is linked when so many steps have passed since it was asked, times the share of
+        it in view. With a smaller one more links measure what is learnt of the camera.
+
     Raises
     ------
     ValueError
@@ -109,18 +116,15 @@ class Odometry:
                 )
             frontend = make_frontend(camera, self._config)
         self._frontend = CheckedFrontend(frontend)
-        self._chain: RawChain[Any] = RawChain(self._frontend, self._config.window)
+        self._chain: RawChain[Any] = RawChain(self._frontend)
         self._window = SlidingWindow(self._config.window)
         self._keyframes: Keyframes[Any] = Keyframes(self._view(), self._config.window)
-        # Keyframes by the raw chain, which was not broken since, and whether it ever was.
-        self._starts: dict[int, Estimate] = {}
-        self._is_broken = False
+        self._is_broken = False  # the raw chain, by a guess
         self._anchor_ns: int | None = None
         self._previous: Estimate | None = None  # by the raw chain
         self._map = Map(self._config, self._frontend.recognizer, self._window, self._keyframes)
         self._trust = DepthTrust()
-        # The last frame and the last registered one, to be extracted again after a change.
-        self._frames: dict[int, Stamped] = {}
+        self.link_gain = LINK_GAIN
 
     @property
     def config(self) -> Config:
@@ -165,8 +169,8 @@ class Odometry:
           `scale_factor` or `upright` of `features` (descriptor): then KLT keyframes, which hold
           their images, are extracted again, and those of descriptors are released.
         - `camera`, `stereo`: what was learnt of the camera is estimated anew.
-        - `loops`, `runtime`: with the next frame. Where loops were not enabled, the map and the
-          global poses begin with it.
+        - `loops`, `runtime`: with the next frame. Where loops were not enabled, places are kept
+          from it on.
         - `sync`, `images`, `depth.scale`, `check`: not here, but where frames are read.
 
         A front-end of one's own is told at once where it is `Reconfigurable`.
@@ -208,7 +212,7 @@ class Odometry:
             self._take_over_configuration()
             observations = self._frontend.extract(frame)
         with watch.stage("register"):
-            step = self._step(observations)
+            step = self._step(frame, observations)
         with watch.stage("links"):
             links = self._link(observations, step)
         with watch.stage("window"):
@@ -216,7 +220,6 @@ class Odometry:
             self._select_keyframes(observations, step, links.scores, causal)
         with watch.stage("loops"):
             joins, loops = self._map.add(observations, causal, links.found, self._chain.anchor)
-        self._keep_frame(frame)
         poses = causal, T_previous_frame
         return self._result(observations, step, links.offered, *poses, joins, loops, watch.stage_ms)
 
@@ -234,7 +237,7 @@ class Odometry:
         Raises
         ------
         SmoothingError
-            When GTSAM fails; before the first frame, and where `loops.enabled` is false.
+            When GTSAM fails, and before the first frame.
         """
         graph = self._map.graph
         graph.settle(self._window.estimate(frame_id) for frame_id in self._window.poses())
@@ -268,7 +271,7 @@ class Odometry:
             n_links=len(offered) - len(causal.rejected),
             registration=step.registration,
             links=judge_links(offered, step.estimate.stamp_ns, self._window),
-            keyframes_ns=tuple(self._keyframes.stamps_ns),
+            keyframes_ns=tuple(self._keyframes.kept),
             segment=self._map.segment,
             joins=joins,
             loops=loops,
@@ -287,68 +290,67 @@ class Odometry:
         former, self._config = self._config, self._next_config
         if self._config is former or self._config == former:
             return
-        extracted = {} if self._is_own else self._renew_frontend(former)
+        if self._camera is not None and not self._is_own:
+            self._renew_frontend(former, self._camera)
         self._window.reconfigure(self._config.window)
-        self._keyframes.reconfigure(self._view(), self._config.window)
-        self._chain.reconfigure(self._frontend, self._config.window, extracted)
+        self._keyframes.camera, self._keyframes.config = self._view(), self._config.window
         self._map.reconfigure(self._config, self._frontend.recognizer)
 
-    def _renew_frontend(self, former: Config) -> dict[int, Any]:
-        """Return what a new front-end extracts from the last frames, where that has changed."""
-        camera = self._camera
-        if camera is None:
-            return {}
+    def _renew_frontend(self, former: Config, camera: StereoCamera | PinholeCamera) -> None:
+        """Make another front-end and extract the last frames again, where that has changed."""
         change = find_change(former, self._config, is_stereo=isinstance(camera, StereoCamera))
-        if change.is_any:
-            offsets = None if change.is_of_rig else self._frontend.rig_offsets
-            if offsets is not None:
-                offsets.reconfigure(self._config)
-            frontend = make_frontend(camera, self._config, rig_offsets=offsets)
-            self._frontend = CheckedFrontend(frontend)
-            if change.is_of_kind:
-                self._map.forget_places()
-        extracted = {}
-        if change.is_of_extraction:
-            frames = sorted(self._frames.items())
-            extracted = {ns: self._frontend.extract(frame) for ns, frame in frames}
+        if not change.is_any:
+            return
+        offsets = None if change.is_of_rig else self._frontend.rig_offsets
+        if offsets is not None:
+            offsets.reconfigure(self._config)
+        self._frontend = CheckedFrontend(make_frontend(camera, self._config, rig_offsets=offsets))
+        self._chain.reconfigure(self._frontend, is_renewed=change.is_of_extraction)
         if change.is_of_kind:
-            self._renew_keyframes(extracted)
-        return extracted
+            self._map.forget_places()
+            self._renew_keyframes()
 
-    def _renew_keyframes(self, extracted: dict[int, Any]) -> None:
+    def _renew_keyframes(self) -> None:
         """Extract keyframes again, and release those whose images are not at hand."""
-        for stamp_ns in self._keyframes.stamps_ns:
-            observations = extracted.get(stamp_ns)
-            frame = frame_of(self._keyframes[stamp_ns])
-            if observations is None and frame is not None:
-                observations = self._frontend.extract(frame)
-            if observations is not None:
-                self._keyframes.replace(observations)
+        for stamp_ns, keyframe in [*self._keyframes.kept.items()]:
+            frame = frame_of(keyframe.observations)
+            if frame is not None:
+                again, start = self._frontend.extract(frame), keyframe.start
+                self._keyframes.add(again, n_steps=keyframe.asked_at, start=start)
                 continue
-            self._keyframes.drop(stamp_ns)
+            del self._keyframes.kept[stamp_ns]
             if stamp_ns in self._window:
                 self._window.release(stamp_ns)
 
-    def _step(self, observations: _Observations) -> RawStep:
+    def _step(self, frame: Stamped, observations: _Observations) -> RawStep:
         """Register a frame against the one before, in the raw chain."""
         offsets = self._frontend.rig_offsets
         step = self._chain.advance(
+            frame,
             observations,
             variance_factor=1.0 if offsets is None else offsets.chain_factor.value,
             seeks_places=self._map.seeks_places,
         )
-        self._note_break(step)
+        self._map.follow(step)
+        if step.failure is not None:  # covariances are what edges state once a pose is a guess
+            self._is_broken = True
+            for keyframe in self._keyframes.kept.values():
+                keyframe.start = None
+        self._window.variance_factor = 1.0
+        if offsets is not None and not self._is_broken:
+            self._window.variance_factor = offsets.window_factor.value
         return step
 
     def _link(self, observations: _Observations, step: RawStep) -> _Links:
         """Measure a frame from its predecessor, from keyframes, and after a gap from places."""
-        self._map.follow(step)
+        offered: list[_Offer] = []
         # A coasted step is no measurement: the window predicts by itself.
-        offered: list[_Offer] = [] if step.registration is None else [("step", step.edge)]
-        if step.reference_ns not in self._window:  # which would refuse the edges
+        if step.edge is not None and step.registration is not None:
+            offered.append(("step", step.edge))
+        if step.edge is None or step.edge.reference_id not in self._window:  # which would refuse it
             return _Links(scores={}, offered=offered)
-        T_frame_keyframes = self._predict_keyframes(step)
-        scores = self._keyframes.scores(T_frame_keyframes)
+        T_frame_keyframes = self._predict_keyframes(step.edge)
+        scores = self._keyframes.scores(T_frame_keyframes, step.n_steps)
         links = self._link_keyframes(observations, step, scores, T_frame_keyframes)
         offered += [("keyframe", edge) for edge in links]
         offered += [("depth", edge) for edge in self._align_depths(observations, links)]
@@ -358,6 +360,14 @@ class Odometry:
         offered += [] if joining is None else [("keyframe", joining)]
         return _Links(scores=scores, offered=offered, found=found, is_joining=joining is not None)
 
+    def _predict_keyframes(self, edge: Edge) -> dict[int, FloatArray]:
+        """Return T_frame_keyframe by stamp, of joined segments, as predicted by the step."""
+        T_world_frame = self._window.pose(edge.reference_id) @ edge.T_reference_frame
+        T_frame_world = se3.invert(T_world_frame)
+        poses, hidden_ns = self._window.poses(self._keyframes.kept), self._map.hidden_ns
+        visible_ns = [ns for ns in self._keyframes.kept if ns in poses and ns not in hidden_ns]
+        return {ns: T_frame_world @ poses[ns] for ns in visible_ns}
+
     def _link_keyframes(
         self,
         observations: _Observations,
@@ -365,22 +375,16 @@ class Odometry:
         scores: dict[int, float],
         T_frame_keyframes: dict[int, FloatArray],
     ) -> list[Edge]:
-        self._keyframes.note_seen(scores, step.n_steps)
-        measure = partial(self._register_keyframe, observations, step)
-        n_unasked = self._keyframes.n_unasked(step.n_steps)
-        config = self._config.window
-        return link_keyframes(measure, scores, T_frame_keyframes, step, config, n_unasked=n_unasked)
-
-    def _predict_keyframes(self, step: RawStep) -> dict[int, FloatArray]:
-        """Return T_frame_keyframe by stamp, of joined segments, as predicted by the step."""
-        T_world_frame = self._window.pose(step.reference_ns) @ step.T_reference_frame
-        T_frame_world = se3.invert(T_world_frame)
-        hidden_ns = self._map.hidden_ns
-        return {
-            ns: T_frame_world @ self._window.pose(ns)
-            for ns in self._keyframes.stamps_ns
-            if ns in self._window and ns not in hidden_ns
-        }
+        kept = self._keyframes.kept
+        return link_keyframes(
+            partial(self._register_keyframe, observations, step),
+            scores,
+            T_frame_keyframes,
+            step,
+            self._config.window,
+            n_unasked={ns: step.n_steps - kept[ns].asked_at for ns in scores},
+            min_gain=self.link_gain,
+        )
 
     def _register_keyframe(
         self,
@@ -389,34 +393,25 @@ class Odometry:
         stamp_ns: int,
         T_keyframe_frame: FloatArray,
     ) -> Edge | None:
-        prior = MotionPrior(T_predicted=T_keyframe_frame, is_confirmed=step.is_registered)
-        result = self._frontend.register(self._keyframes[stamp_ns], observations, prior)
-        is_linked = isinstance(result, RelativePose)
-        self._keyframes.note_attempt(stamp_ns, step.n_steps, is_linked=is_linked)
+        keyframe, is_registered = self._keyframes.kept[stamp_ns], step.failure is None
+        prior = MotionPrior(T_predicted=T_keyframe_frame, is_confirmed=is_registered)
+        result = self._frontend.register(keyframe.observations, observations, prior)
+        keyframe.asked_at, keyframe.is_linked = step.n_steps, isinstance(result, RelativePose)
         if isinstance(result, Failure):
             return None
         T, covariance = result.T_reference_current, result.covariance
         link = Edge(reference_id=stamp_ns, T_reference_frame=T, covariance=covariance)
-        self._note_misclosure(link, step)
+        if keyframe.start is not None:
+            self._note_misclosure(link, keyframe.start, step.estimate)
         return link
 
-    def _note_break(self, step: RawStep) -> None:
-        """Let covariances be what edges state once a pose rests on a guess."""
-        if step.failure is not None:
-            self._starts, self._is_broken = {}, True
-        offsets = None if self._is_broken else self._frontend.rig_offsets
-        self._window.variance_factor = 1.0 if offsets is None else offsets.window_factor.value
-
-    def _note_misclosure(self, link: Edge, step: RawStep) -> None:
+    def _note_misclosure(self, link: Edge, start: Estimate, end: Estimate) -> None:
         """Tell the front-end how well a link agrees with the raw chain since its keyframe."""
-        offsets, start = self._frontend.rig_offsets, self._starts.get(int(link.reference_id))  # type: ignore[call-overload]
-        if offsets is None or start is None:
-            return
-        if step.estimate.stamp_ns - start.stamp_ns < _MIN_LOOP_NS:
-            return
-        factor = offsets.chain_factor
-        scaled = replace(link, covariance=factor.value * link.covariance)
-        factor.note(factor.value * misclosure(scaled, start, step.estimate))
+        offsets = self._frontend.rig_offsets
+        if offsets is not None and end.stamp_ns - start.stamp_ns >= _MIN_LOOP_NS:
+            factor = offsets.chain_factor
+            scaled = replace(link, covariance=factor.value * link.covariance)
+            factor.note(factor.value * misclosure(scaled, start, end))
 
     def _align_depths(self, observations: _Observations, links: list[Edge]) -> list[Edge]:
         """Return what depth alone measured beside links, where colour contradicts it."""
@@ -428,8 +423,8 @@ class Odometry:
 
     def _align_depth(self, observations: _Observations, link: Edge) -> Edge | None:
         """Measure a link again by depth alone; None where that is not believed."""
-        T, keyframe = link.T_reference_frame, self._keyframes[int(link.reference_id)]  # type: ignore[call-overload]
-        depth = self._frontend.align_depth(keyframe, observations, T)
+        T, keyframe = link.T_reference_frame, self._keyframes.kept[source_ns(link)]
+        depth = self._frontend.align_depth(keyframe.observations, observations, T)
         if isinstance(depth, Failure):
             return None
         self._trust.note(RelativePose(T_reference_current=T, covariance=link.covariance), depth)
@@ -440,23 +435,21 @@ class Odometry:
 
     def _smooth(self, step: RawStep, links: _Links) -> tuple[Estimate, FloatArray | None]:
         """Add a frame to the window; return its causal pose, and that in the frame before."""
-        stamp_ns, offsets = step.estimate.stamp_ns, self._frontend.rig_offsets
+        raw, offsets = step.estimate, self._frontend.rig_offsets
         edges = [edge for _, edge in links.offered]
         status = Status.RESUMED if links.is_joining else None
-        causal = self._window.add_pose(stamp_ns, stamp_ns, edges, status=status)
+        causal = self._window.add_pose(raw.stamp_ns, raw.stamp_ns, edges, status=status)
         if offsets is not None:
             offsets.window_factor.note(self._window.misfit)
-        return causal, self._last_step(step.estimate, causal)
-
-    def _last_step(self, raw: Estimate, causal: Estimate) -> FloatArray | None:
-        """Return T_previous_frame, of one state of the window; by the raw chain without one."""
         previous, self._previous = self._previous, raw
         if previous is None:
-            return None
+            return causal, None
+        # Of one state of the window; by the raw chain where it has not both.
+        T_world_previous, T_world_frame = previous.T_world_frame, raw.T_world_frame
         if previous.stamp_ns in self._window:
             T_world_previous = self._window.pose(previous.stamp_ns)
-            return np.asarray(se3.invert(T_world_previous) @ causal.T_world_frame)
-        return np.asarray(se3.invert(previous.T_world_frame) @ raw.T_world_frame)
+            T_world_frame = causal.T_world_frame
+        return causal, np.asarray(se3.invert(T_world_previous) @ T_world_frame)
 
     def _select_keyframes(
         self, observations: _Observations, step: RawStep, scores: dict[int, float], causal: Estimate
@@ -465,46 +458,38 @@ class Odometry:
         is_tied = causal.status in (Status.OK, Status.RESUMED)
         if is_tied and causal.frame_id in self._window:
             if self._is_keyframe_needed(scores):
-                self._keyframes.add(observations, n_steps=step.n_steps)
-                self._starts[causal.stamp_ns] = step.estimate
+                self._keyframes.add(observations, n_steps=step.n_steps, start=step.estimate)
                 self._window.keep(causal.stamp_ns)
-            self._release_keyframes(scores, step.n_steps)
+            self._release_keyframes(scores)
         self._keep_anchor()
 
     def _is_keyframe_needed(self, scores: dict[int, float]) -> bool:
-        config = self._config.window
         # A keyframe that cannot be registered stands for nothing that is in view.
-        return config.n_keyframes > 0 and is_needed(self._keyframes.registrable(scores))
+        kept = self._keyframes.kept
+        linked = {ns: score for ns, score in scores.items() if kept[ns].is_linked}
+        return self._config.window.n_keyframes > 0 and is_needed(linked)
 
-    def _release_keyframes(self, scores: dict[int, float], n_steps: int) -> None:
-        config, unjoined = self._config.window, self._map.unjoined_ns
-        n_over = len(self._keyframes) - len(unjoined) - config.n_keyframes
-        released = choose_unseen(scores, self._keyframes.n_unseen(n_steps), max(n_over, 0))
-        n_waiting = max(config.n_keyframes // _WAITING, 1)
-        for stamp_ns in released + unjoined[: max(len(unjoined) - n_waiting, 0)]:
-            self._keyframes.drop(stamp_ns)
+    def _release_keyframes(self, scores: dict[int, float]) -> None:
+        kept, unjoined = self._keyframes.kept, self._map.unjoined_ns
+        n_keyframes = self._config.window.n_keyframes
+        n_over = max(len(kept) - len(unjoined) - n_keyframes, 0)
+        seen_at = {ns: keyframe.seen_at for ns, keyframe in kept.items()}
+        n_waiting = max(n_keyframes // _WAITING, 1)
+        too_many = unjoined[: max(len(unjoined) - n_waiting, 0)]
+        for stamp_ns in choose_unseen(scores, seen_at, n_over) + too_many:
+            del kept[stamp_ns]
             self._window.release(stamp_ns)
-        for stamp_ns in self._keyframes.stamps_ns:
-            if stamp_ns not in self._window:
-                self._keyframes.drop(stamp_ns)
-        kept_ns = self._keyframes.stamps_ns
-        self._starts = {ns: each for ns, each in self._starts.items() if ns in kept_ns}
+        for stamp_ns in [ns for ns in kept if ns not in self._window]:
+            del kept[stamp_ns]
 
     def _keep_anchor(self) -> None:
         """Keep the frame that the chain comes back to, however long it coasts."""
         anchor, previous = self._chain.anchor, self._anchor_ns
         self._anchor_ns = None if anchor is None else anchor.stamp_ns
-        if previous not in self._keyframes.stamps_ns and previous in self._window:
+        if previous not in self._keyframes and previous in self._window:
             self._window.release(previous)
         if self._anchor_ns in self._window:
             self._window.keep(self._anchor_ns)
-
-    def _keep_frame(self, frame: Stamped) -> None:
-        if self._is_own:
-            return
-        frames = {**self._frames, frame.stamp_ns: frame}
-        needed = self._anchor_ns, frame.stamp_ns
-        self._frames = {ns: each for ns, each in frames.items() if ns in needed}
 
 
 def _check_frame(frame: Stamped, camera: StereoCamera | PinholeCamera) -> None:

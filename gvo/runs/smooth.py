@@ -63,7 +63,7 @@ class Smoother:
         self.notes = notes or SmoothingNotes()
         self.window = SlidingWindow(config.window, keyframes=keyframes)
         self.statuses: Counter[Status] = Counter()
-        self.chain = EdgeChain(config.window)
+        self.chain = EdgeChain()
 
     @property
     def n_poses(self) -> int:

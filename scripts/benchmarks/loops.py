@@ -194,7 +194,7 @@ def after_dark(
         return [np.nan] * 5
     T = se3.invert(known.T_world_frame[1]) @ known.T_world_frame[0]
     camera = as_stereo(source.info.camera)
-    figures = [view_overlap(seen.points_current[seen.inliers], T, camera)]
+    figures = [float(view_overlap(seen.points_current[seen.inliers], T, camera))]
     for name in ("causal", "smoothed"):
         for trajectories in runs:
             ends = trajectories[name].select(np.isin(trajectories[name].stamps_ns, ends_ns))

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gvo import Config, RelativePose, StereoCamera
+from gvo import RelativePose, StereoCamera
 from gvo.frontend.klt import KltPlace
 from gvo.frontend.rig import FrameMotion
 from gvo.geometry import se3
@@ -135,7 +135,7 @@ class Stream:
         n_lap = EVERY * (n_frames * 4 // 5 // EVERY)
         self.truth = around_the_block(n_frames, n_lap)
         self.rng = np.random.default_rng(0)
-        self.graph = RunGraph(Config().window)
+        self.graph = RunGraph()
         self.frontend = Frontend(self.truth, n_lap, self.rng)
         self.detector = LoopDetector(frontend=self.frontend, graph=self.graph)
         self.graph.loops = self.detector.loops

@@ -38,7 +38,7 @@ def check(recording: Source, black: Black) -> None:
     assert found < 1.5 * expected
 
 
-# Shorter than window.lost_after_s, and the camera turns: the frame before is not seen again.
+# Too short to be lost, and the camera turns: the frame before is not seen again.
 @pytest.mark.recorded
 def test_a_second_in_the_dark_costs_the_global_poses_nothing(gvo_data: Path) -> None:
     recording = gvo.open_recording(gvo_data / "rgbd_dataset_freiburg1_rpy_part")

@@ -105,9 +105,9 @@ def test_links_go_where_many_unlinked_steps_or_many_points_lie_between() -> None
 
 def test_those_seen_least_recently_are_released_and_of_these_the_least_in_view() -> None:
     scores = {1: 0.9, 2: 0.0, 3: 0.1, 4: 0.2}
-    unseen = {1: 0, 2: 7, 3: 12, 4: 7}
-    assert choose_unseen(scores, unseen, 0) == []
-    assert choose_unseen(scores, unseen, 3) == [3, 2, 4]
+    seen_at = {1: 12, 2: 5, 3: 0, 4: 5}
+    assert choose_unseen(scores, seen_at, 0) == []
+    assert choose_unseen(scores, seen_at, 3) == [3, 2, 4]
 
 
 def test_frames_need_no_order_of_their_own() -> None:

@@ -162,8 +162,8 @@ def test_the_covariance_of_coasting_grows_by_the_sigmas_per_second() -> None:
         window, _ = straight_window()
         before = window.covariance(3)
         estimate = window.add_pose("x", 3 * STEP_NS + round(seconds * 1e9), [])
-        turn = np.deg2rad(CONFIG.coasting_sigma_deg_per_s) * seconds
-        shift = CONFIG.coasting_sigma_m_per_s * seconds
+        turn = np.deg2rad(30.0) * seconds
+        shift = 3.0 * seconds
         sigmas = np.r_[np.full(3, turn), np.full(3, shift)]
         Ad = se3.adjoint(se3.invert(window.pose("x")) @ window.pose(3))
         expected = Ad @ before @ Ad.T + np.diag(sigmas**2)
@@ -178,8 +178,8 @@ def test_a_gap_of_many_poses_loses_none_and_an_edge_across_it_brings_all_back() 
         estimate = window.add_pose(frame, frame * STEP_NS, [])
         assert_sound(estimate)
         seconds = 1e-9 * (frame - last) * STEP_NS
-        if abs(seconds - CONFIG.lost_after_s) > 0.15:  # a step more or less is all the same
-            is_lost = seconds > CONFIG.lost_after_s
+        if abs(seconds - 2.0) > 0.15:  # a step more or less is all the same
+            is_lost = seconds > 2.0
             assert estimate.status == (Status.LOST if is_lost else Status.COASTING)
     across = step @ step
     back = window.add_pose(44, 44 * STEP_NS, [edge(last, across, 1e-3)])
@@ -479,25 +479,11 @@ def test_the_gate_is_that_of_the_present() -> None:
     assert [r.reference_id for r in window.add_pose(7, 7 * STEP_NS, [*good, wrong]).rejected] == [4]
 
 
-def test_coasting_goes_on_over_a_change_and_is_lost_by_the_new_limit() -> None:
-    window, _ = reconfigured({}, WindowConfig(), 5)
-    statuses = []
-    for frame in range(5, 11):
-        if frame == 8:
-            window.reconfigure(WindowConfig(lost_after_s=0.35, coasting_sigma_m_per_s=300.0))
-        estimate = window.add_pose(frame, frame * STEP_NS, [])
-        statuses.append((estimate.status, estimate.covariance[5, 5] > 100.0))
-    assert [status for status, _ in statuses] == [Status.COASTING] * 3 + [Status.LOST] * 3
-    assert [is_unsure for _, is_unsure in statuses] == [False] * 3 + [True] * 3
-
-
 configurations = st.builds(
     WindowConfig,
     size=st.none() | st.integers(2, 30),
     kernel=st.sampled_from(["none", "huber", "cauchy", "geman_mcclure", "dcs"]),
     gate=st.none() | st.floats(0.5, 20.0),
-    lost_after_s=st.floats(0.1, 5.0),
-    coasting_sigma_m_per_s=st.floats(0.01, 100.0),
 )
 
 

@@ -62,7 +62,7 @@ def on_terminal(*arguments: object, columns: int = 80) -> Shown:
 
 
 def test_a_terminal_shows_rate_time_left_and_tracked_share(room_bag: Path, tmp_path: Path) -> None:
-    settings = ["--set", "ransac.min_inliers=5000", "--set", "window.lost_after_s=0.1"]
+    settings = ["--set", "ransac.min_inliers=5000"]
     options = ["--out", tmp_path, "--no-report", "--every", "2"]
     shown = on_terminal("run", room_bag, *options, *settings)
     assert shown.code == 3

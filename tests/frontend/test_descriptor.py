@@ -77,7 +77,7 @@ def configure(kind: Kind = "orb", threads: int = 1, **sections: dict[str, object
             "max_edge_step": 0.05,
             "edge_radius_px": 2,
         },
-        "temporal": {"radius_px": 6.0, "wide_radius_px": 40.0, "max_distance": 0.25},
+        "temporal": {"radius_px": 10.0, "max_distance": 0.25},
         "ransac": {"n_hypotheses": 100, "min_inliers": 12, "min_disparity_px": 2.0},
         "runtime": {"threads": threads},
     }
@@ -237,8 +237,8 @@ def test_what_is_tried_before_a_frame_is_registered_teaches_nothing(
     assert len(noted) == 1
 
 
-def test_a_wrong_prediction_finds_nothing_where_the_wide_search_is_no_wider() -> None:
-    config = configure(temporal={"radius_px": 6.0, "wide_radius_px": 6.0, "max_distance": 0.12})
+def test_a_wrong_prediction_finds_nothing_where_the_wide_search_ends_before() -> None:
+    config = configure(temporal={"radius_px": 1.5, "max_distance": 0.12})
     frontend = DescriptorFrontend(CAMERA, config)
     pair = [frontend.extract(stereo_frame(x, stamp_ns=i)) for i, x in enumerate((0.0, 0.12))]
     assert isinstance(frontend.register(pair[0], pair[1], expect(-0.12)), Failure)

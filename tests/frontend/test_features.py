@@ -108,10 +108,7 @@ def test_cells_of_a_very_wide_image_are_told_apart() -> None:
 def test_faint_images_are_tried_with_the_low_threshold() -> None:
     faint = (120 + (blobs().astype(float) - 120) / 10).astype(np.uint8)
     for kind in KINDS[::2]:
-        high = extract(faint, kind, fast_threshold=40, low_fast_threshold=40)
-        low = extract(faint, kind, fast_threshold=40, low_fast_threshold=3)
-        assert len(low) > len(high) + 50 or kind == "fast"
-        assert len(low) >= len(high)
+        assert len(extract(faint, kind, fast_threshold=40)) > 20
 
 
 @pytest.mark.parametrize("kind", ["orb", "fast", "gftt"])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import gvo
-from gvo.config import Config, WindowConfig
+from gvo.config import Config
 from gvo.frontend import registration, rig
 from gvo.frontend.factory import make_frontend
 from gvo.geometry import se3
@@ -126,9 +126,9 @@ def test_the_recent_velocity_is_the_median_of_the_last_second() -> None:
     # Uneven, so that every other number of steps, and their mean, would be seen.
     steps_m = [0.01 * n**2 for n in range(30)]
     frontend = Scripted(list(steps_m))
-    chain: RawChain[Seen] = RawChain(frontend, WindowConfig())
+    chain: RawChain[Seen] = RawChain(frontend)
     for n in range(len(steps_m) + 1):
-        chain.advance(Seen(100_000_000 * n))
+        chain.advance(Seen(100_000_000 * n), Seen(100_000_000 * n))
     # At 10 Hz: those that ended a second ago or later, and the last one.
     expected = [np.median(steps_m[max(n - 11, 0) : n]) for n in range(1, len(steps_m))]
     np.testing.assert_allclose(frontend.recent_m, expected, atol=1e-12)

@@ -7,7 +7,6 @@ from typing import TypeAlias
 
 import numpy as np
 
-from gvo.config import WindowConfig
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.odometry.graph import RunGraph
@@ -70,11 +69,10 @@ class Drive:
         n_links: int = 2,
         bias: Bias = None,
         sigmas: FloatArray = SIGMAS,
-        config: WindowConfig | None = None,
         max_frames: int = 3000,
     ) -> None:
         self.truth, self.rng, self.bias, self.sigmas = truth, rng, bias, sigmas
-        self.graph = RunGraph(config or WindowConfig(), max_frames=max_frames)
+        self.graph = RunGraph(max_frames=max_frames)
         self.every, self.n_links = every, n_links
         self.keyframes = [0]
         self.edges: list[list[Edge]] = []

@@ -33,7 +33,7 @@ def edge(reference: int, T: FloatArray, sigma: float = 0.1) -> Edge:
 @given(st.integers(0, 2**32 - 1))
 def test_the_chain_is_the_product_of_the_first_edges(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    chain = EdgeChain(WindowConfig())
+    chain = EdgeChain()
     T = [se3.exp(rng.normal(size=6))]
     chain.advance(causal(0, T[0]), [], None)
     for n in range(1, 8):
@@ -46,7 +46,7 @@ def test_the_chain_is_the_product_of_the_first_edges(seed: int) -> None:
 
 
 def test_an_unusable_edge_is_passed_over() -> None:
-    chain = EdgeChain(WindowConfig())
+    chain = EdgeChain()
     chain.advance(causal(0), [], None)
     step = se3.exp(np.array([0.0, 0.0, 0.1, 1.0, 0.0, 0.0]))
     edges = [edge(0, np.full((4, 4), np.nan)), edge(77, np.eye(4)), edge(0, step)]
@@ -55,7 +55,7 @@ def test_an_unusable_edge_is_passed_over() -> None:
 
 
 def test_without_an_edge_the_last_velocity_goes_on() -> None:
-    chain = EdgeChain(WindowConfig())
+    chain = EdgeChain()
     chain.advance(causal(0), [], None)
     step = se3.exp(np.array([0.0, 0.0, 0.1, 1.0, 0.0, 0.0]))
     before = chain.advance(causal(1), [edge(0, step)], None)
@@ -69,7 +69,7 @@ def test_without_an_edge_the_last_velocity_goes_on() -> None:
 def test_short_steps_without_an_edge_grow_as_unsure_as_a_long_one() -> None:
     sigmas = []
     for n_steps in (1, 10):
-        chain = EdgeChain(WindowConfig())
+        chain = EdgeChain()
         chain.advance(causal(0), [], None)
         chain.advance(causal(1), [edge(0, np.eye(4))], None)
         for step in range(1, n_steps + 1):
@@ -80,7 +80,7 @@ def test_short_steps_without_an_edge_grow_as_unsure_as_a_long_one() -> None:
 
 
 def test_without_an_edge_a_known_pose_begins_the_chain_anew() -> None:
-    chain = EdgeChain(WindowConfig())
+    chain = EdgeChain()
     chain.advance(causal(0), [], None)
     T = se3.exp(np.arange(6.0))
     raw = chain.advance(causal(1), [], PosePrior(T_world_frame=T, covariance=np.eye(6)))
@@ -89,7 +89,7 @@ def test_without_an_edge_a_known_pose_begins_the_chain_anew() -> None:
 
 
 def test_a_forgotten_pose_is_no_reference() -> None:
-    chain = EdgeChain(WindowConfig())
+    chain = EdgeChain()
     for n in range(2):
         chain.advance(causal(n), [edge(0, np.eye(4))] if n else [], None)
     chain.forget([0])
@@ -98,7 +98,7 @@ def test_a_forgotten_pose_is_no_reference() -> None:
 
 
 def test_the_covariance_grows_along_the_chain() -> None:
-    chain = EdgeChain(WindowConfig())
+    chain = EdgeChain()
     traces = []
     for n in range(5):
         edges = [edge(n - 1, np.eye(4))] if n else []

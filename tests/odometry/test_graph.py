@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from gvo.backend.batch import BatchOptimizer, WholeGraph
 from gvo.backend.factors import ORIGIN
-from gvo.config import WindowConfig
 from gvo.errors import SmoothingError
 from gvo.geometry import se3
 from gvo.odometry.graph import RunGraph
@@ -104,7 +103,7 @@ def test_the_covariances_tell_the_errors() -> None:
 )
 def test_the_world_and_the_order_of_loops_are_free(twist: list[float], order: list[int]) -> None:
     T = se3.exp(np.array(twist))
-    drive, moved = looped(1), RunGraph(WindowConfig())
+    drive, moved = looped(1), RunGraph()
     for j, edges in enumerate(drive.edges):
         T_world_frame = T @ drive.truth[j]
         moved.add_frame(estimate_at(j * PERIOD_NS, T_world_frame), edges, is_place=j % 5 == 0)
@@ -115,7 +114,7 @@ def test_the_world_and_the_order_of_loops_are_free(twist: list[float], order: li
 
 def test_frames_between_keyframes_lie_between_both_ends() -> None:
     # Steps of 1 m along x are 10 % short: a loop stretches them.
-    graph = RunGraph(WindowConfig())
+    graph = RunGraph()
     step = se3.make_transform(np.eye(3), np.array([0.9, 0.0, 0.0]))
     T, edges = np.eye(4), list[Edge]()
     for j in range(21):
@@ -129,31 +128,29 @@ def test_frames_between_keyframes_lie_between_both_ends() -> None:
     np.testing.assert_allclose(np.diff(x), 1.0, atol=0.01)
 
 
-@pytest.mark.parametrize("is_changed", [False, True])
-def test_frames_after_a_loss_go_with_what_comes_after_it(is_changed: bool) -> None:
-    truth = np.array([se3.exp(np.array([0, 0.01 * j, 0, 0, 0, 0.5 * j])) for j in range(16)])
-    anywhere = WindowConfig(coasting_sigma_m_per_s=100.0, coasting_sigma_deg_per_s=900.0)
-    graph, drive = RunGraph(WindowConfig() if is_changed else anywhere), Drive(truth)
-    graph.reconfigure(anywhere)
-    for j in range(16):
-        # From frame 8 on the camera was somewhere else than the guess says.
+def test_frames_after_a_loss_go_with_what_comes_after_it() -> None:
+    truth = np.array([se3.exp(np.array([0, 0.01 * j, 0, 0, 0, 0.05 * j])) for j in range(66)])
+    graph, drive = RunGraph(), Drive(truth)
+    for j in range(66):
+        # After five seconds in the dark the camera is somewhere else than the guess says.
         status, edges = Status.OK, []
-        if j == 8:
+        if 8 <= j <= 58:
             status = Status.LOST
         elif j > 0:
             edges = [measured(truth, j - 1, j, SIGMAS, None)]
         T = truth[j] if j < 8 else truth[j] @ se3.exp(np.array([0, 0.5, 0, 3.0, 0, 0]))
         estimate = estimate_at(j * PERIOD_NS, T, status=status)
         graph.add_frame(estimate, edges, is_place=j % 5 == 0)
-    graph.loops = [drive.loop(0, 15)]
+    graph.loops = [drive.loop(0, 65)]
     optimum = graph.optimize()
-    np.testing.assert_allclose(poses(optimum), truth, atol=1e-3)
-    assert max(float(np.trace(each.covariance)) for each in optimum.estimates) < 0.1
+    seen = [*range(8), *range(58, 66)]
+    np.testing.assert_allclose(poses(optimum)[seen], truth[seen], atol=1e-3)
+    assert max(float(np.trace(optimum.estimates[j].covariance)) for j in seen) < 0.1
 
 
 def test_covariances_are_proper_through_ten_seconds_in_the_dark() -> None:
     truth = np.array([se3.exp(np.array([0, 0, 0, 0, 0, 1.0 * j])) for j in range(120)])
-    graph = RunGraph(WindowConfig())
+    graph = RunGraph()
     for j, T in enumerate(truth):
         is_dark = 10 <= j <= 110
         edges = [] if is_dark or j == 0 else [measured(truth, j - 1, j, SIGMAS, None)]
@@ -262,7 +259,7 @@ def test_an_edge_beyond_all_bounds_is_an_error() -> None:
 
 
 def test_rotations_that_are_not_quite_orthonormal_add_up_to_no_invalid_edge() -> None:
-    drive, graph = looped(0), RunGraph(WindowConfig())
+    drive, graph = looped(0), RunGraph()
     for j, edges in enumerate(drive.edges):
         scale = np.diag([1.0 + 2e-7, 1.0 + 2e-7, 1.0 + 2e-7, 1.0])
         scaled = [replace(e, T_reference_frame=e.T_reference_frame @ scale) for e in edges]
@@ -298,7 +295,7 @@ def test_a_frame_that_is_merged_takes_little_memory() -> None:
 
 
 def test_a_graph_that_begins_later_leaves_out_what_was_before() -> None:
-    whole, later = Drive(block(0.3, n_per_lap=N_LAP)).run(), RunGraph(WindowConfig())
+    whole, later = Drive(block(0.3, n_per_lap=N_LAP)).run(), RunGraph()
     for j in range(10, 30):
         pose = estimate_at(j * PERIOD_NS, whole.truth[j])
         later.add_frame(pose, whole.edges[j], is_place=j % 5 == 0)
@@ -307,7 +304,7 @@ def test_a_graph_that_begins_later_leaves_out_what_was_before() -> None:
 
 def test_pairs_of_frames_that_nothing_else_connects_are_merged_and_placed() -> None:
     truth = np.array([se3.exp(np.array([0, 0, 0, 0, 0, 0.1 * j])) for j in range(400)])
-    graph = RunGraph(WindowConfig(), max_frames=10)
+    graph = RunGraph(max_frames=10)
     for j in range(400):
         edges = [measured(truth, j - 1, j, SIGMAS, None)] if j % 2 or j > 390 else []
         graph.add_frame(estimate_at(j * PERIOD_NS, truth[j]), edges, is_place=j > 390)

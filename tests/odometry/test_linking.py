@@ -9,7 +9,7 @@ from gvo.config import WindowConfig
 from gvo.geometry import se3
 from gvo.odometry.chain import RawStep
 from gvo.odometry.keyframes import link_keyframes
-from gvo.types import Edge, Estimate, FloatArray, RelativePose, Status
+from gvo.types import Edge, Estimate, Failure, FloatArray, RelativePose, Status
 
 CONFIG = WindowConfig(n_links=3, gate=10.0)
 # The first is chosen, the other is spare: two steps ago.
@@ -23,9 +23,7 @@ def forward(distance_m: float) -> FloatArray:
     return se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, distance_m]))
 
 
-def step_of(
-    *, is_registered: bool = True, is_steady: bool = True, reference_ns: int | None = 90
-) -> RawStep:
+def step_of(*, is_registered: bool = True, is_steady: bool = True) -> RawStep:
     covariance = SIGMA**2 * np.eye(6)
     registration = RelativePose(
         T_reference_current=forward(1.0),
@@ -37,10 +35,9 @@ def step_of(
         estimate=Estimate(
             stamp_ns=100, T_world_frame=np.eye(4), covariance=covariance, status=Status.OK
         ),
-        reference_ns=reference_ns,
-        T_reference_frame=forward(1.0),
-        covariance=covariance,
+        edge=Edge(reference_id=90, T_reference_frame=forward(1.0), covariance=covariance),
         registration=registration if is_registered else None,
+        failure=None if is_registered else Failure(reason="blank"),
         is_steady=is_steady,
     )
 

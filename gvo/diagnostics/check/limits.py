@@ -75,7 +75,7 @@ RULES: Mapping[str, Rule] = {
     ),
     # The velocity that predicts the next frame is wrong by as much.
     "jitter": Rule(high=0.3, unit="%", fix="stamp at the exposure, not where messages arrive"),
-    # Odometry coasts over shorter gaps with little harm; `window.lost_after_s` is the fault.
+    # Odometry coasts over shorter gaps with little harm; after `LOST_AFTER_S` it is lost: a fault.
     "gaps": Rule(high=0.5, unit="s", fix="find what stalled the recording: disk, bandwidth"),
     # `STAMP_DIFFERENCES_MS` has the limit of each sensor.
     "stamp difference": Rule(

@@ -98,10 +98,11 @@ def _learn(
     """Return what odometry learns of the readout time in each part, and its sigma, in ms."""
     learning = {
         "camera": config.camera.model_copy(update={"readout_ms": None}),
-        "window": config.window.model_copy(update={"link_gain": _LINK_GAIN}),
     }
     config = config.model_copy(update=learning)
     runs = [Odometry(source.info.camera, config) for _ in parts]
+    for run in runs:
+        run.link_gain = _LINK_GAIN
     chosen = ChosenImages(info=source.info, images=partial(_images_of, source, parts))
     for frame in _usable(chosen, config):
         part = _part_of(frame.stamp_ns, parts)

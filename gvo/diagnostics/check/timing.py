@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from gvo.backend.motion_model import LOST_AFTER_S
 from gvo.config import Config
 from gvo.diagnostics.check.findings import Finding
 from gvo.diagnostics.check.limits import (
@@ -77,7 +78,7 @@ def _check_stream(name: str, stamps_ns: IntArray, config: Config) -> Iterator[Fi
     yield measured(f"{name}: jitter", jitter_s / period_s, text=text)
     longest_s = float(forward_s.max())
     gap_s = longest_s if longest_s > _GAP_PERIODS * period_s else 0.0
-    yield measured(f"{name}: gaps", gap_s, fault_high=config.window.lost_after_s)
+    yield measured(f"{name}: gaps", gap_s, fault_high=LOST_AFTER_S)
     n_dropped = int(np.sum(np.maximum(np.rint(forward_s / period_s) - 1, 0)))
     yield lost(f"{name}: dropped frames", n_dropped, n + n_dropped)
 

@@ -216,7 +216,7 @@ class _Drive:
         T_frame_world = se3.invert(result.causal.T_world_frame)
         T_frame_earlier = T_frame_world @ self._odometry.window.pose(stamp_ns)
         points = self._frontend.extracted[stamp_ns].points_cam
-        return view_overlap(points, T_frame_earlier, self._frontend.own.camera)
+        return float(view_overlap(points, T_frame_earlier, self._frontend.own.camera))
 
     def _why_unlinked(self, answer: RelativePose | Failure | None, overlap: float) -> str:
         if isinstance(answer, Failure):

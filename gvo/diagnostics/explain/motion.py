@@ -10,7 +10,7 @@ import numpy as np
 from gvo.config import Config
 from gvo.diagnostics.explain.extraction import as_mask, distance_tests
 from gvo.diagnostics.explain.values import Registration, Sorting
-from gvo.frontend.descriptor import DescriptorFrontend, is_step
+from gvo.frontend.descriptor import WIDE, DescriptorFrontend, is_step
 from gvo.frontend.klt import KltFrontend
 from gvo.frontend.matching import compare_within, predict_pixels
 from gvo.frontend.registration import find_consensus
@@ -54,7 +54,7 @@ def explain_registration(frontend: OwnFrontend, asked: Asked, config: Config) ->
         matches = _sort_tracks(frontend, asked, attempts[-1])
         start = None if is_wide else prior
     else:
-        radius_px = config.temporal.wide_radius_px if is_wide else config.temporal.radius_px
+        radius_px = (WIDE if is_wide else 1.0) * config.temporal.radius_px
         matches = _sort_descriptors(frontend, asked, attempts[-1], radius_px, config)
     return Registration(
         attempts=tuple(_describe(attempts, asked.result)),
