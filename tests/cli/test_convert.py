@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 import gvo
 from gvo.geometry.se3 import make_transform
 from gvo.io.convert.convert import convert
-from gvo.io.recording import StampedImage
 from gvo.io.synthetic import SyntheticRecording
 from gvo.trajectory.formats import read_trajectory
 from tests.conftest import Command, refused
-from tests.io.conftest import Item, ListSource, Tiny
+from tests.io.conftest import Tiny
+from tests.make.recordings import Held, Item, held
 
 _TRAJECTORIES = ("raw.txt", "causal.txt", "smoothed.txt")
 
@@ -25,31 +25,9 @@ def kitti(tmp_path: Path) -> Path:
     return Tiny().write_kitti(tmp_path / "kitti", n_frames=3)
 
 
-def test_there_and_back_again(command: Command, tmp_path: Path, kitti: Path) -> None:
-    for name in ("a.bag", "b.mcap", "c.db3", "d"):
-        answer = command("convert", kitti, tmp_path / name)
-        assert (answer.code, answer.err) == (0, "")
-        assert answer.out == f"wrote {tmp_path / name}: 6 images, 3 true poses\n"
-        back = tmp_path / f"back_{name[0]}"
-        assert command("convert", tmp_path / name, back).code == 0
-        assert (back / "calib.txt").read_text().split() == _rows(kitti)
-        mine = [(image.stamp_ns, image.load().tobytes()) for image in _images(back)]
-        assert mine == [(image.stamp_ns, image.load().tobytes()) for image in _images(kitti)]
-
-
-def _rows(kitti: Path) -> list[str]:
-    """Return the numbers of the two cameras that were converted."""
-    lines = (kitti / "calib.txt").read_text().splitlines()
-    return [word for line in lines[:2] for word in line.split()]
-
-
-def _images(folder: Path) -> list[StampedImage]:
-    return list(gvo.open_recording(folder).images())
-
-
 def test_the_body_of_a_data_set_is_a_frame_of_its_bag(command: Command, tmp_path: Path) -> None:
     rendered = SyntheticRecording("handheld", "stereo", n_frames=4, scale=0.25)
-    source = ListSource(
+    source = held(
         "stereo",
         [(image.stream, image.stamp_ns, image.load()) for image in rendered.images()],
         calibrations=rendered.info.calibrations,
@@ -82,7 +60,7 @@ def test_the_body_of_a_data_set_is_a_frame_of_its_bag(command: Command, tmp_path
     )
 
 
-def _noise(stamps_ns: Sequence[int], delay_ns: int = 0) -> ListSource:
+def _noise(stamps_ns: Sequence[int], delay_ns: int = 0) -> Held:
     tiny = Tiny()
     items: list[Item] = [
         (stream, stamp_ns + delay_ns * stream, tiny.texture(2 * k + stream))

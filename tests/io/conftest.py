@@ -1,7 +1,6 @@
 """Tiny recordings, made by hand."""
 
-from collections.abc import Iterator, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,41 +11,10 @@ import yaml
 from numpy.typing import NDArray
 
 from gvo.geometry.camera import Calibration, PinholeCamera
-from gvo.io.recording import RecordingInfo, Sensor, StampedImage
-from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame, Frame, StereoFrame
+from tests.make.recordings import Held, Item, held
 
 _WIDTH, _HEIGHT = 48, 32
-
-Item = tuple[int, int, NDArray[Any] | Exception]
-
-
-class ListSource:
-    """A recording in memory: stream, stamp, and pixels or what loading raises."""
-
-    def __init__(
-        self,
-        sensor: Sensor,
-        items: Sequence[Item],
-        *,
-        calibrations: tuple[Calibration, ...],
-        truth: Trajectory | None = None,
-    ) -> None:
-        self.items = items
-        self._truth = truth
-        self.info = RecordingInfo(
-            name="list",
-            sensor=sensor,
-            calibrations=calibrations,
-            n_images=sum(item[0] == 0 for item in items),
-        )
-
-    def images(self) -> Iterator[StampedImage]:
-        for stream, stamp_ns, pixels in self.items:
-            yield StampedImage(stream=stream, stamp_ns=stamp_ns, load=partial(_give, pixels))
-
-    def ground_truth(self) -> Trajectory | None:
-        return self._truth
 
 
 class Tiny:
@@ -71,14 +39,14 @@ class Tiny:
         depth[0, :2] = np.nan
         return depth
 
-    def stereo(self, items: Sequence[Item], **options: Any) -> ListSource:
+    def stereo(self, items: Sequence[Item], **options: Any) -> Held:
         left = Calibration.from_camera(self.camera)
         right = Calibration.from_camera(self.camera, baseline=0.5)
-        return ListSource("stereo", items, **({"calibrations": (left, right)} | options))
+        return held("stereo", items, **({"calibrations": (left, right)} | options))
 
-    def rgbd(self, items: Sequence[Item], **options: Any) -> ListSource:
+    def rgbd(self, items: Sequence[Item], **options: Any) -> Held:
         calibration = Calibration.from_camera(self.camera)
-        return ListSource("rgbd", items, **({"calibrations": (calibration,)} | options))
+        return held("rgbd", items, **({"calibrations": (calibration,)} | options))
 
     def ros_camera(self, **changes: object) -> dict[str, object]:
         """Return a calibration in the form of ROS; keys of value None are left out."""
@@ -169,12 +137,6 @@ class Tiny:
         if isinstance(frame, StereoFrame):
             return ("stereo", frame.stamp_ns, frame.left.tobytes(), frame.right.tobytes())
         return ("rgbd", frame.stamp_ns, frame.image.tobytes(), frame.depth.tobytes())
-
-
-def _give(pixels: NDArray[Any] | Exception) -> NDArray[Any]:
-    if isinstance(pixels, Exception):
-        raise pixels
-    return pixels
 
 
 @pytest.fixture(scope="session")

@@ -68,19 +68,6 @@ def test_an_excerpt_is_as_defined(items: list[Pair | FaultyFrame], cut: int, eve
         assert taken == inside
 
 
-@given(items=_recordings, cut_s=st.integers(1, 50))
-def test_excerpts_that_follow_one_another_hold_each_frame_once(
-    items: list[Pair | FaultyFrame], cut_s: int
-) -> None:
-    parts = []
-    for excerpt in (Excerpt(duration_s=cut_s), Excerpt(start_s=cut_s)):
-        try:
-            parts += list(take_excerpt(items, excerpt))
-        except RecordingError:
-            assert _stamp_ns(items[-1]) - _FIRST_NS < cut_s * _SECOND
-    assert parts == items
-
-
 def test_a_faulty_frame_is_given_where_a_frame_is_due() -> None:
     kinds = [True, False, True, False, True, False]
     items = [_item(n, is_pair=is_pair) for n, is_pair in enumerate(kinds)]

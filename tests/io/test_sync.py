@@ -29,13 +29,6 @@ _KNOWN = [
         [(0, 0), (2, 1), (4, 2), (6, 3)],
     ),
     (
-        [0, 33, 67, 100, 133, 167, 200],
-        [10, 77, 143, 210],
-        20,
-        1.0,
-        [(0, 0), (2, 1), (4, 2), (6, 3)],
-    ),
-    (
         [0, 33, 66, 99, 132],
         [16, 50, 82, 116, 148],
         20,
@@ -43,19 +36,12 @@ _KNOWN = [
         [(0, 0), (1, 1), (2, 2), (3, 3), (4, 4)],
     ),
     ([0, 33, 66, 99, 132], [16, 50, 82, 116, 148], 20, 0.0, [(0, 0), (2, 1), (3, 2), (4, 3)]),
-    ([0, 33, 66, 99, 132], [17, 49, 83, 115, 149], 20, 0.0, [(1, 0), (2, 1), (3, 2), (4, 3)]),
     ([100, 200, 150, 300], [100, 200, 150, 300], 20, 0.1, [(0, 0), (1, 1), (3, 3)]),
     ([100, 100, 130], [95, 100, 100, 131], 20, 0.1, [(0, 1), (2, 3)]),
-    ([100, 90, 110, 130], [95, 115, 105, 135], 20, 0.1, [(0, 0), (2, 1), (3, 3)]),
-    ([50, 40, 60], [45, 70], 20, 0.1, [(0, 0), (2, 1)]),
-    ([0, 10, 20, 30, 100], [31, 101], 40, 0.1, [(3, 0), (4, 1)]),
     ([0, 10, 20, 31, 100], [31, 101], 40, 0.1, [(3, 0), (4, 1)]),
     ([31, 101], [0, 10, 20, 30, 100], 40, 0.1, [(0, 3), (1, 4)]),
-    ([5, 26], [0, 21, 30], 20, 0.1, [(0, 0), (1, 2)]),
     ([0, 20, 40, 60, 80], [19, 41, 59, 81], 20, 0.1, [(1, 0), (2, 1), (3, 2), (4, 3)]),
-    ([100, 200], [200, 100], 0, 0.1, [(1, 0)]),
     ([1, 3, 2, 4], [1, 2, 3, 4], 0, 0.1, [(0, 0), (2, 1), (1, 2), (3, 3)]),
-    ([1, 1, 2], [1, 2, 2], 0, 0.1, [(1, 0), (2, 1)]),
     # nearer by the penalty exactly, in floating point
     ([10**8], [89_000_000, 110_000_000], 20_000_000, 0.1, [(0, 0)]),
     ([100], [88, 110], 20, 0.1, [(0, 1)]),
@@ -144,15 +130,6 @@ def test_every_image_of_the_first_stream_is_answered_once(
     assert sorted(answered) == sorted(first)
     if limit_ns > 0 or first == sorted(set(first)):
         assert answered == first
-
-
-@given(first=_stamps, second=_stamps, order=_order, limit_ns=st.sampled_from([0, _LIMIT]))
-def test_the_stamps_of_pairs_increase_whatever_comes(
-    first: list[int], second: list[int], order: list[bool], limit_ns: int
-) -> None:
-    answers = _pair(first, second, order, limit_ns=limit_ns)
-    stamps = [answer[0] for answer in answers if isinstance(answer, tuple)]
-    assert stamps == sorted(set(stamps))
 
 
 @given(
@@ -304,17 +281,3 @@ def test_each_image_comes_through_or_is_taken_out(steps: list[tuple[int, int]]) 
         assert order == sorted(order)
     n_left = sum(image.stream == 0 for image in through)
     assert n_left + len(stray.take_faulty()) == sum(stream == 0 for stream, _ in steps)
-
-
-def test_the_reason_tells_how_far_ahead_the_stamp_is() -> None:
-    stray = StampFilter(
-        [_image(0, 0), _image(1, 7 * _S), _image(0, 9 * _S), _image(0, 1), _image(1, 2)]
-    )
-    assert [image.stamp_ns for image in stray.images()] == [0, 7 * _S, 1, 2]
-    (frame,) = stray.take_faulty()
-    assert frame.stamp_ns == 9 * _S
-    assert (
-        frame.reason
-        == "the stamp is 9 s ahead of the one before, and the next one goes back to 1 ns"
-    )
-    assert stray.take_faulty() == []

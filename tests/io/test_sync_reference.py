@@ -230,15 +230,6 @@ def test_queues_overflow_as_those_of_message_filters(
     _check(reference, messages, queue_size, limit, age_penalty, is_overflowing=True)
 
 
-@pytest.mark.acceptance
-@pytest.mark.parametrize("age_penalty", [0.1, 0.25, 0.5])
-def test_durations_scale_to_the_same_nanosecond(reference: Reference, age_penalty: float) -> None:
-    for later_ns in range(1, 50):
-        for earlier_ns in range(later_ns, 2 * later_ns):
-            messages = [(0, 1000), (1, 1000 - earlier_ns), (1, 1000 + later_ns)]
-            _check(reference, messages, 100, 100, age_penalty, is_overflowing=False)
-
-
 def _camera_stamps(
     rng: np.random.Generator, rate: float, jitter_s: float, share_missing: float
 ) -> NDArray[np.int64]:

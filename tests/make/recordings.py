@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 from numpy.typing import NDArray
 
 import gvo
 from gvo.errors import RecordingError
-from gvo.io.recording import RecordingInfo, Source, StampedImage
+from gvo.geometry.camera import Calibration
+from gvo.io.recording import RecordingInfo, Sensor, Source, StampedImage
 from gvo.io.synthetic import SyntheticRecording
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame, Frame
 
+Item = tuple[int, int, NDArray[Any] | Exception]
+"""Stream, stamp, and pixels or what loading raises."""
 Change = Callable[[NDArray[Any]], NDArray[Any]]
 
 
@@ -74,6 +77,29 @@ class Held:
         truth = None if self.truth is None else self.truth.select(slice(0, n_frames))
         info = replace(self.info, n_images=n_frames)
         return Held(info=info, items=self.items[: 2 * n_frames], truth=truth)
+
+
+def held(
+    sensor: Sensor,
+    items: Sequence[Item],
+    *,
+    calibrations: tuple[Calibration, ...],
+    truth: Trajectory | None = None,
+) -> Held:
+    """Return a recording of given images."""
+    images = [
+        StampedImage(stream=stream, stamp_ns=stamp_ns, load=partial(_give, pixels))
+        for stream, stamp_ns, pixels in items
+    ]
+    n_images = sum(image.stream == 0 for image in images)
+    info = RecordingInfo(name="list", sensor=sensor, calibrations=calibrations, n_images=n_images)
+    return Held(info=info, items=images, truth=truth)
+
+
+def _give(pixels: NDArray[Any] | Exception) -> NDArray[Any]:
+    if isinstance(pixels, Exception):
+        raise pixels
+    return pixels
 
 
 def frames_of(source: Source) -> list[Frame]:

@@ -170,16 +170,3 @@ def test_registered_depth_is_left_alone(tmp_path: Path, name: str, depth: dict[s
     found = _found(tmp_path / "a.bag", [*_rgbd(name, **depth), *mounts])
     assert found.depth_view is None
     assert not any(line.startswith("depth: ") for line in found.decisions)
-
-
-@pytest.mark.recorded
-def test_the_recorded_depth_is_placed_by_what_librealsense_wrote(gvo_data: Path) -> None:
-    reader = BagReader(gvo_data / "bags" / "good" / "realsense_rgbd.bag")
-    topics = choose_topics(reader.topics, TopicChoice(), "")
-    found = calibrations_of_messages(reader, topics, "")
-    assert found.depth_scale == 1000.0
-    assert found.depth_view is not None
-    assert found.depth_view.calibration.K[0, 0] == pytest.approx(390.43, abs=0.01)
-    # A D435: the colour camera stands 15 mm left of the depth camera.
-    T_color_depth = found.depth_view.T_color_depth
-    np.testing.assert_allclose(T_color_depth[:3, 3], [0.0143, 0.0006, 0.0006], atol=1e-4)

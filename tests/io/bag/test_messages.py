@@ -163,17 +163,6 @@ def test_an_image_whose_header_does_not_fit_its_data_is_refused(
         decode_grey_or_color(message, "/image")
 
 
-def test_colour_and_doubles_are_no_depth_and_floats_are_no_grey(tiny: Any) -> None:
-    with pytest.raises(
-        RecordingError, match=r"encoding '64FC1' is not supported, expected .*32FC1"
-    ):
-        decode_depth(_message(tiny.depth(1).astype(np.float64), "64FC1"), 1000.0, "/depth")
-    with pytest.raises(RecordingError, match="encoding 'bgr8'"):
-        decode_depth(_message(tiny.texture(1, is_color=True), "bgr8"), 1000.0, "/depth")
-    with pytest.raises(RecordingError, match="encoding '32FC1'"):
-        decode_grey_or_color(_message(tiny.depth(1), "32FC1"), "/image")
-
-
 def _compressed(pixels: NDArray[Any], format_: str, suffix: str = ".png") -> Any:
     """Encode pixels in BGR order as a file does."""
     _, data = cv2.imencode(suffix, pixels)

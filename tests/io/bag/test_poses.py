@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gvo.errors import RecordingError
 from gvo.geometry import se3
-from gvo.io.bag.poses import POSE_TYPES, Positions, find_topics, read_positions, read_streams
+from gvo.io.bag.poses import POSE_TYPES, Positions, read_positions, read_streams
 from gvo.io.bag.reader import BagReader
 from gvo.io.edges.events import InputFaults
 from gvo.io.edges.pose_streams import PoseStream
@@ -70,14 +69,6 @@ def test_the_covariance_of_a_message_is_that_of_its_own_perturbations(tmp_path: 
         assert np.abs((C - expected) / scale).max() < 0.06
 
 
-def test_messages_without_a_rotation_are_skipped_and_counted(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.bag", {"/poses": STAMPED}, norms=(1.0, 0.0, 1.0, 1.0))
-    stream, faults = read(path)
-    assert len(stream.poses) == N - 1
-    (warning,) = faults.warnings()
-    assert warning.startswith("1 messages hold no pose")
-
-
 def test_stamps_that_go_back_are_skipped_and_counted(tmp_path: Path) -> None:
     bag = PoseBag(tmp_path / "a.bag")
     for stamp_ns in (10, 20, 20, 15, 30):
@@ -86,17 +77,6 @@ def test_stamps_that_go_back_are_skipped_and_counted(tmp_path: Path) -> None:
     assert stream.poses.stamps_ns.tolist() == [10, 20, 30]
     (warning,) = faults.warnings()
     assert warning.startswith("2 poses have a stamp that does not advance")
-
-
-@pytest.mark.recorded
-def test_recorded_streams_are_read(gvo_data: Path) -> None:
-    odometry, _ = read(gvo_data / "bags/good/nav2_turtlebot.mcap", "/odom")
-    assert len(odometry.poses) == 2639
-    assert np.isfinite(odometry.covariances).all()
-    for name in ("tf_example.bag", "realsense_rgbd.bag"):
-        path = gvo_data / "bags/good" / name
-        with pytest.raises(RecordingError, match="holds no poses"):
-            find_topics(BagReader(path), [], name)
 
 
 def test_a_topic_tells_its_frames_and_keeps_to_them(tmp_path: Path) -> None:
@@ -148,13 +128,6 @@ def test_what_is_no_fix_is_skipped_and_counted_and_is_no_origin(tmp_path: Path) 
     (warning,) = faults.warnings()
     assert warning.startswith("5 messages hold no position and were skipped; the first: /fix at 0")
     assert "status -1" in warning
-
-
-def test_a_topic_without_any_fix_is_refused(tmp_path: Path) -> None:
-    bag = PoseBag(tmp_path / "a.bag")
-    bag.fix(0, HELSINKI, status=-1)
-    with pytest.raises(RecordingError, match="/fix: holds no position: 1 messages"):
-        read_places(bag.write())
 
 
 def test_points_are_positions_in_their_frame(tmp_path: Path) -> None:

@@ -171,9 +171,3 @@ def test_several_bags_are_merged_by_the_time_of_recording(
 
 def _write_times(path: Path, log_times_ns: list[int]) -> Path:
     return write(path, _images("/a", log_times_ns, is_ros1=path.suffix == ".bag"))
-
-
-def test_the_name_of_a_database_may_hold_any_character(tmp_path: Path) -> None:
-    path = tmp_path / "a#b?c%20 ü.db3"
-    path.write_bytes(_write(tmp_path / "a.db3").read_bytes())
-    assert len(list(BagReader(path).messages(["/a"]))) == _N

@@ -7,11 +7,7 @@ from typing import NamedTuple
 import pytest
 
 from gvo.errors import RecordingError
-from gvo.io.bag.file import BagFile
 from gvo.io.bag.reader import BagReader
-from gvo.io.bag.recovery.mcap import McapScan
-from gvo.io.bag.recovery.ros1 import Ros1Scan
-from gvo.io.bag.recovery.scan import Scan
 
 pytestmark = pytest.mark.recorded
 
@@ -105,29 +101,3 @@ def test_a_bag_is_refused_in_one_line(gvo_data: Path, name: str) -> None:
     assert str(caught.value).startswith(f"{path}: ")
     assert _REFUSED[name] in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        *("good/compressed_image.bag", "good/nav2_turtlebot.mcap", "good/ros2_all_types_mcap"),
-        *("good/realsense_rgbd.bag", "good/tf_bz2.bag", "good/tf_example.bag"),
-    ],
-)
-def test_the_walk_over_the_records_finds_what_the_index_does(gvo_data: Path, name: str) -> None:
-    path = gvo_data / "bags" / name
-    if path.is_dir():
-        (path,) = (file for file in path.iterdir() if file.suffix != ".yaml")
-    indexed, scan = BagFile(path), _scan(path)
-    names = {channel.name for channel in indexed.counts}
-    expected, found = list(indexed.messages(names)), list(scan.messages(names))
-    assert scan.counts == indexed.counts
-    assert Counter(found) == Counter(expected)
-    if name != "good/realsense_rgbd.bag":  # whose chunks overlap
-        assert found == expected
-    assert scan.damage == ""
-    assert scan.start_time_ns == indexed.start_time_ns
-
-
-def _scan(path: Path) -> Scan:
-    return Ros1Scan(path) if path.suffix == ".bag" else McapScan(path)

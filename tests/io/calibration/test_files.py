@@ -281,19 +281,6 @@ def test_a_stereo_pair_is_two_cameras(tmp_path: Path, tiny: Any) -> None:
         _stereo([mono, mono])
 
 
-def test_a_folder_that_does_not_tell_which_file_is_refused(tmp_path: Path, tiny: Any) -> None:
-    with pytest.raises(CalibrationError, match=r"expected cam0/sensor.yaml .* got 0 of these"):
-        _rgbd(tmp_path)
-    _write(tmp_path / "a.yaml", tiny.ros_camera())
-    assert _rgbd(tmp_path).origin.endswith("a.yaml")
-    _write(tmp_path / "b.yml", tiny.ros_camera())
-    with pytest.raises(CalibrationError, match="got 2 of these"):
-        _rgbd(tmp_path)
-    _write(tmp_path / "left.yaml", _ros("plumb_bob", 0))
-    _write(tmp_path / "right.yaml", _ros("plumb_bob", 1))
-    assert _stereo(tmp_path).baseline_from == "P"
-
-
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
@@ -333,3 +320,16 @@ def test_a_file_that_holds_no_keys_is_refused(tmp_path: Path, text: str) -> None
         read_calibration_file(path)
     with pytest.raises(CalibrationError, match="cannot be read"):
         read_calibration_file(tmp_path / "none.yaml")
+
+
+def test_a_folder_that_does_not_tell_which_file_is_refused(tmp_path: Path, tiny: Any) -> None:
+    with pytest.raises(CalibrationError, match=r"expected cam0/sensor.yaml .* got 0 of these"):
+        _rgbd(tmp_path)
+    _write(tmp_path / "a.yaml", tiny.ros_camera())
+    assert _rgbd(tmp_path).origin.endswith("a.yaml")
+    _write(tmp_path / "b.yml", tiny.ros_camera())
+    with pytest.raises(CalibrationError, match="got 2 of these"):
+        _rgbd(tmp_path)
+    _write(tmp_path / "left.yaml", _ros("plumb_bob", 0))
+    _write(tmp_path / "right.yaml", _ros("plumb_bob", 1))
+    assert _stereo(tmp_path).baseline_from == "P"

@@ -6,22 +6,18 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from rosbags.highlevel import AnyReader
 
 from gvo.io.convert.convert import convert
 from gvo.io.opening import open_recording
-from tests.io.conftest import Item, Tiny
+from tests.io.conftest import Tiny
+from tests.make.recordings import Item
+from tests.make.rendered_walk import read_bag
 
 _NAMES = pytest.mark.parametrize("name", ["a.bag", "a.mcap"])
 
 
 def _messages(path: Path, topic: str) -> list[Any]:
-    with AnyReader([path]) as reader:
-        connections = [one for one in reader.connections if one.topic == topic]
-        return [
-            reader.deserialize(data, connection.msgtype)
-            for connection, _, data in reader.messages(connections)
-        ]
+    return [message for _, message in read_bag(path)[topic]]
 
 
 @_NAMES

@@ -83,14 +83,3 @@ def test_the_pose_on_the_body_is_that_of_the_rectified_camera(tmp_path: Path, ti
         R = info.calibrations[0].R
         np.testing.assert_allclose(info.T_body_cam[:3, :3], T_body_left[:3, :3] @ R.T, atol=1e-12)
         np.testing.assert_allclose(info.T_body_cam[:3, 3], T_body_left[:3, 3], atol=1e-12)
-    # the file's own pose on its body counts
-    moved = yaml.safe_load(sensors[0].read_text())
-    moved["T_BS"]["data"][3] += 1.0
-    (tmp_path / "0.yaml").write_text(yaml.safe_dump(moved))
-    moved = yaml.safe_load(sensors[1].read_text())
-    moved["T_BS"]["data"][3] += 1.0
-    (tmp_path / "1.yaml").write_text(yaml.safe_dump(moved))
-    info = EurocSource(folder, calibration=[tmp_path / "0.yaml", tmp_path / "1.yaml"]).info
-    assert info.T_body_cam is not None
-    assert info.T_body_cam[0, 3] == pytest.approx(T_body_left[0, 3] + 1.0)
-    assert "rectification: the poses of both on the body of 0.yaml + 1.yaml" in info.decisions

@@ -36,13 +36,6 @@ def test_colour_cameras_are_read_where_grey_ones_are_missing(tmp_path: Path, tin
     np.testing.assert_allclose(truth.positions[2] - truth.positions[0], [0, 0, 2], atol=1e-12)
 
 
-def test_a_missing_image_shifts_no_stamps(tmp_path: Path, tiny: Any) -> None:
-    folder = tiny.write_kitti(tmp_path / "00", 4)
-    (folder / "image_0" / "000001.png").unlink()
-    stamps = [image.stamp_ns for image in KittiSource(folder).images() if image.stream == 0]
-    assert stamps == [0, 200_000_000, 300_000_000]
-
-
 def test_poses_are_found_beside_and_in_the_official_layout(tmp_path: Path, tiny: Any) -> None:
     folder = tiny.write_kitti(tmp_path / "sequences" / "07")
     beside = KittiSource(folder).ground_truth()

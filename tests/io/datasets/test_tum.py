@@ -121,19 +121,3 @@ def test_depth_and_colour_are_undistorted_with_the_same_camera(tmp_path: Path, t
     raw, _ = cv2.projectPoints(np.array([[x, y, 1.0]]), np.zeros(3), np.zeros(3), K, np.array(D))
     column, row = np.rint(np.ravel(raw)).astype(int)
     assert frame.depth[v, u] == tiny.depth(0)[row, column]
-
-
-def test_the_truth_is_read_where_there_is_one(tmp_path: Path, tiny: Any) -> None:
-    folder = tiny.write_tum(tmp_path / "f", _COLOR, _DEPTH)
-    assert TumSource(folder).ground_truth() is None
-    (folder / "groundtruth.txt").write_text("# truth\n1305031102.1753 1 2 3 0 0 0 1\n")
-    truth = TumSource(folder).ground_truth()
-    assert truth is not None
-    np.testing.assert_array_equal(truth.positions, [[1, 2, 3]])
-
-
-def test_depth_that_makes_no_sense_at_all_is_doubted(tmp_path: Path, tiny: Any) -> None:
-    folder = tiny.write_tum(tmp_path / "f", _COLOR, _DEPTH)
-    for stamp in _DEPTH:
-        tiny.write_image(folder / "depth" / f"{stamp}.png", tiny.counts(0) // 1000 + 1)
-    assert "implausible" in _depth_decision(TumSource(folder))

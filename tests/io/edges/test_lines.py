@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from gvo.geometry import se3
 from gvo.io.edges.lines import Request, format_estimate, parse_line, read_lines
-from gvo.io.edges.pose_streams import StepSigma
 from gvo.types import Edge, Estimate, PosePrior, PositionPrior, Rejected, Status
 
 seeds = st.integers(0, 2**32 - 1)
@@ -52,12 +51,6 @@ def test_an_edge_holds_the_numbers_of_the_line(seed: int) -> None:
 def test_sigmas_are_standard_deviations_rotation_first() -> None:
     edge = edge_of(sigmas=[0.1, 0.2, 0.3, 1, 2, 3])
     np.testing.assert_allclose(edge.covariance, np.diag([0.01, 0.04, 0.09, 1.0, 4.0, 9.0]))
-
-
-def test_without_noise_an_edge_gets_that_of_its_motion() -> None:
-    edge = edge_of()
-    expected = StepSigma().covariance(edge.T_reference_frame)
-    np.testing.assert_array_equal(edge.covariance, expected)
 
 
 def test_a_prior_is_a_pose_or_a_position_in_the_world() -> None:

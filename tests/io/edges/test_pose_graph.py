@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import gtsam
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -10,7 +9,7 @@ from hypothesis import strategies as st
 
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
-from gvo.io.edges.events import EdgeEvent, Event, PoseEvent
+from gvo.io.edges.events import Event, PoseEvent
 from gvo.io.edges.pose_graph import GRAPH, PoseGraphSource, write_graph
 from gvo.trajectory.g2o import format_edge, format_vertex
 from gvo.types import FloatArray, PosePrior
@@ -41,18 +40,6 @@ def describe(event: Event) -> tuple[object, ...]:
     return ("edge", event.edge.reference_id, event.frame_id)
 
 
-def test_poses_come_with_the_edges_of_the_lines_that_follow_at_once(tmp_path: Path) -> None:
-    lines = [edge_line(*ends) for ends in [(0, 1), (1, 2), (0, 2), (2, 3), (0, 1), (3, 4)]]
-    assert [describe(event) for event in events_of(write(tmp_path, *lines))] == [
-        ("pose", 0),
-        ("pose", 1, 0),
-        ("pose", 2, 1, 0),
-        ("pose", 3, 2),
-        ("edge", 0, 1),
-        ("pose", 4, 3),
-    ]
-
-
 def test_an_edge_from_a_new_pose_is_turned_round(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     T = se3.exp(rng.normal(size=6))
@@ -71,20 +58,6 @@ def test_an_edge_from_a_new_pose_is_turned_round(tmp_path: Path) -> None:
     assert after @ np.linalg.solve(edge.covariance, after) == pytest.approx(
         before @ np.linalg.solve(covariance, before)
     )
-
-
-def test_edges_between_unknown_poses_wait_until_they_are_connected(tmp_path: Path) -> None:
-    ends = [(0, 1), (5, 6), (6, 7), (5, 7), (1, 5), (7, 8)]
-    events = events_of(write(tmp_path, *(edge_line(*pair) for pair in ends)))
-    assert [describe(event) for event in events] == [
-        ("pose", 0),
-        ("pose", 1, 0),
-        ("pose", 5, 1),
-        ("pose", 6, 5),
-        ("pose", 7, 5),
-        ("edge", 6, 7),
-        ("pose", 8, 7),
-    ]
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
@@ -140,13 +113,6 @@ def test_a_fixed_pose_holds_the_world_wherever_it_stands(tmp_path: Path, positio
     assert all(event.prior is None for event in others if isinstance(event, PoseEvent))
 
 
-def test_several_fixed_poses_get_their_vertices_as_priors(tmp_path: Path) -> None:
-    lines = [format_vertex(n, translation(10.0 + n)) for n in (0, 1, 2)]
-    events = events_of(write(tmp_path, *lines, "FIX 0 2", edge_line(0, 1), edge_line(1, 2)))
-    priors = [e.prior for e in events if isinstance(e, PoseEvent)]
-    assert [prior is not None for prior in priors] == [True, False, True]
-
-
 def test_the_first_vertex_holds_the_world_where_nothing_is_fixed(tmp_path: Path) -> None:
     lines = [format_vertex(n, translation(10.0 + n)) for n in (2, 0)]
     first = events_of(write(tmp_path, *lines, edge_line(0, 2)))[0]
@@ -169,17 +135,6 @@ def test_measurements_are_given_as_they_were_read(tmp_path: Path) -> None:
     first, fix, old, last = PoseGraphSource(path).measurement_lines
     assert (first, fix, last) == (edge_line(0, 1), "FIX 0", edge_line(2, 1))
     assert old.startswith("EDGE_SE3:QUAT 1 2 1.0 0.0 0.0 0.0 0.0 0.0 1.0 1.0 0.0")
-
-
-@pytest.mark.parametrize("name", ["pose3example-grid.txt", "pose3example.txt"])
-def test_gtsams_examples_are_connected(name: str) -> None:
-    path = Path(gtsam.findExampleDataFile(name))  # type: ignore[no-untyped-call]
-    source = PoseGraphSource(path)
-    events = list(source.events())
-    graph, _ = gtsam.readG2o(str(path), True)
-    n_edges = sum(1 if isinstance(e, EdgeEvent) else len(e.edges) for e in events)
-    assert n_edges == graph.size()
-    assert not source.faults
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,6 @@ from gvo.io.edges.pose_streams import (
 from gvo.trajectory.formats import (
     COVARIANCE_HEADER,
     format_covariance_line,
-    write_kitti,
     write_tum,
 )
 from gvo.trajectory.trajectory import StampsFrom, Trajectory
@@ -85,12 +84,6 @@ def test_nothing_is_interpolated_over_a_gap() -> None:
     assert [len(event.edges) for event in events] == [0, 2, 2, 2, 1, 1, 1, 1, 1, 1, 1, 1, 2]
 
 
-def test_a_step_from_pose_to_pose_over_a_gap_needs_no_interpolation() -> None:
-    first = sampled([0.0, 0.1, 0.2, 0.3, 2.0, 2.1])
-    events, _ = fuse(first, sampled([0.0, 0.1, 0.2, 0.3, 2.0, 2.1]))
-    assert [len(event.edges) for event in events] == [0, 2, 2, 2, 2, 2]
-
-
 def test_an_input_without_a_common_stamp_is_told() -> None:
     _, source = fuse(sampled([0.0, 0.1]), sampled([5.0, 5.1]))
     (warning,) = source.faults.warnings()
@@ -101,22 +94,6 @@ def test_stamped_and_bare_rows_do_not_mix() -> None:
     bare = sampled([0.0], stamps_from="rows")
     with pytest.raises(TrajectoryError, match=r"rows holds rows .* times\.txt"):
         FusedChains([sampled([0.0]), bare], [StepSigma()] * 2)
-
-
-def test_bare_rows_of_different_length_are_the_same_frames(tmp_path: Path) -> None:
-    paths = [tmp_path / "a.txt", tmp_path / "b.txt"]
-    for path, n in zip(paths, (5, 3), strict=True):
-        poses = np.stack([motion(0.1 * i) for i in range(n)])
-        write_kitti(path, Trajectory(stamps_ns=np.arange(n), T_world_frame=poses))
-    source = FusedChains([read_stream(path) for path in paths], [StepSigma()] * 2)
-    assert source.has_made_up_stamps
-    assert [len(event.edges) for event in source.events() if isinstance(event, PoseEvent)] == [
-        0,
-        2,
-        2,
-        1,
-        1,
-    ]
 
 
 def random_covariance(rng: np.random.Generator) -> FloatArray:

@@ -22,7 +22,7 @@ from gvo.io.poses.truth import (
     read_poses,
 )
 from gvo.types import Failure, FloatArray
-from tests.make.bags import FIX, ODOMETRY, STAMPED, TRANSFORM, WITH_COVARIANCE, PoseBag
+from tests.make.bags import ODOMETRY, STAMPED, TRANSFORM, WITH_COVARIANCE, PoseBag
 
 SECOND = 10**9
 
@@ -53,16 +53,6 @@ def test_a_topic_gives_poses_at_the_stamps_of_its_headers(
     assert truth.trajectory.stamps_from == "topic"
     assert truth.child_frame == child
     assert truth.decision == f"/truth ({type_}), 3 poses{' of base' if child else ''}"
-
-
-def test_of_two_poses_of_one_stamp_the_later_counts_and_bad_ones_are_told(tmp_path: Path) -> None:
-    bag = PoseBag(tmp_path / "a.bag")
-    bag.pose("/truth", STAMPED, 1, pose(1))
-    bag.pose("/truth", STAMPED, 1, pose(2))
-    bag.pose("/truth", STAMPED, 2, pose(3), norm=0.0)
-    truth = read(bag.write(), "/truth")
-    np.testing.assert_allclose(truth.trajectory.T_world_frame, [pose(2)], atol=1e-12)
-    assert "1 poses; 1 messages hold no pose and were skipped; the first: /truth" in truth.decision
 
 
 def chain_bag(path: Path) -> PoseBag:
@@ -159,16 +149,6 @@ def test_the_only_topic_of_such_a_name_is_taken_beside_odometry(tmp_path: Path, 
     truth = find(bag.write())
     assert isinstance(truth, Poses)
     assert truth.decision.startswith(f"/mocap/robot ({type_}), 1 poses")
-
-
-def test_odometry_and_fixes_are_never_taken(tmp_path: Path) -> None:
-    bag = PoseBag(tmp_path / "a.bag")
-    bag.pose("/odom", ODOMETRY, 1, POSE)
-    bag.fix(1, [48.0, 11.0, 500.0])
-    assert FIX in {topic.type for topic in BagReader(bag.write()).topics}
-    found = find(tmp_path / "a.bag")
-    assert isinstance(found, Failure)
-    assert found.reason == "no frame and no topic is named as ground truth"
 
 
 def test_the_frame_of_converted_data_sets_comes_first(tmp_path: Path) -> None:

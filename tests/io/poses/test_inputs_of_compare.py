@@ -68,18 +68,6 @@ def test_poses_are_brought_to_the_frame_of_the_reference(bag: Path) -> None:
         assert measures(found) == pytest.approx([0.0] * 4, abs=1e-5)
 
 
-def test_what_cannot_be_brought_to_the_frame_is_compared_with_a_warning(bag: Path) -> None:
-    other = PoseBag(bag.parent / "other.bag")
-    other.pose("/drone", ODOMETRY, 0, np.eye(4), child="vicon/drone")
-    texts = [f"{bag}#/slam", f"{bag}#/fix"]
-    _, estimates, warnings = read_compared(f"{other.write()}#/drone", texts)
-    assert warnings == [
-        "/slam is of cam, the reference of vicon/drone: tf does not connect the two",
-        "/fix is of gps, the reference of vicon/drone: positions without rotations cannot be moved",
-    ]
-    np.testing.assert_allclose(estimates["/slam"].T_world_frame, MOTION @ T_BASE_CAM, atol=1e-9)
-
-
 @pytest.mark.parametrize("name", RUN_NAMES)
 def test_estimates_of_a_run_are_brought_by_the_frames_of_their_own(
     run_bag: Path, bag: Path, name: str

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import gvo
-from gvo.errors import RecordingError, TrajectoryError
+from gvo.errors import TrajectoryError
 from gvo.io.poses.base_frame import BaseFrame, find_base_frame
 from gvo.io.poses.inputs import read_compared, read_ground_truth, read_truth, recorded_truth
 from gvo.io.poses.truth import Truth, initial_pose
@@ -17,7 +17,6 @@ from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure
 from tests.make.bags import ODOMETRY, TRANSFORM, PoseBag
 from tests.make.rendered_walk import (
-    CAMERA,
     STAMPS_NS,
     START_NS,
     T_BASE_CAM,
@@ -38,15 +37,6 @@ def test_the_place_of_the_camera_comes_from_the_chain_of_tf(robot: Source, name:
     assert frame.name == "base_link"
     assert frame.fixed_mount is not None
     np.testing.assert_allclose(frame.fixed_mount, T_BASE_CAM, atol=1e-12)
-
-
-def test_a_frame_that_nothing_connects_is_refused(robot: Source, walk_bag: Path) -> None:
-    with pytest.raises(RecordingError, match=f"--frame gripper: no transform from .* {CAMERA}"):
-        find_base_frame(robot, "gripper")
-    with pytest.raises(RecordingError, match=r"walk: --frame base_link: .*--calibration FILE"):
-        find_base_frame(gvo.open_recording(walk_bag), "base_link")
-    with pytest.raises(RecordingError, match=r"walk: --frame body: .*--calibration FILE"):
-        find_base_frame(Walk(), "body")
 
 
 def test_poses_of_a_frame_out_of_reach_are_refused_if_asked(walk_bag: Path, tmp_path: Path) -> None:

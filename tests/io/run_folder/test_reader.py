@@ -93,31 +93,6 @@ def test_loops_are_lines_between_their_poses(copy: Path) -> None:
     ]
 
 
-def test_smoothed_poses_may_come_in_any_order(copy: Path) -> None:
-    path = copy / "smoothed.txt"
-    expected = read_run(copy).trajectories["smoothed"]
-    path.write_text("".join(reversed(path.read_text().splitlines(keepends=True))))
-    found = read_run(copy).trajectories["smoothed"]
-    np.testing.assert_array_equal(found.T_world_frame, expected.T_world_frame)
-
-
-def test_a_folder_of_smoothed_edges_has_no_tables_of_edges_and_times(copy: Path) -> None:
-    for name in ("edges.csv", "timings.csv", "ground_truth.txt"):
-        (copy / name).unlink()
-    (copy / "frames.csv").write_text(
-        "stamp_ns,frame_id,status,n_edges,n_rejected,reason\n5,a,ok,2,1,\n"
-    )
-    record = read_run(copy)
-    assert (record.edges, record.timings, record.truth) == ({}, {}, None)
-    assert {name: values.tolist() for name, values in record.frames.items()} == {
-        "stamp_ns": [5],
-        "status": ["ok"],
-        "n_edges": [2],
-        "n_rejected": [1],
-        "reason": [""],
-    }
-
-
 def test_positions_are_read_as_such_and_estimates_moved_to_their_point(copy: Path) -> None:
     (copy / "ground_truth.txt").unlink()
     (copy / "ground_truth_positions.csv").write_text("stamp_ns,x_m,y_m,z_m\n0,1,2,3\n9,1,2,4\n")

@@ -42,15 +42,6 @@ def test_a_folder_that_another_process_writes_is_busy_until_that_ends(tmp_path: 
     assert list(out.iterdir()) == []
 
 
-def test_a_folder_is_free_again_whatever_ended_the_run(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), written_alone(tmp_path):
-        raise KeyboardInterrupt
-    assert list(tmp_path.iterdir()) == []
-    with written_alone(tmp_path / "new"):
-        assert (tmp_path / "new").is_dir()
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_what_cannot_be_written_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with (
@@ -83,14 +74,6 @@ def test_a_folder_with_an_earlier_result_is_refused(tmp_path: Path, name: str) -
     with written_alone(tmp_path, force=True):
         pass
     assert [path.name for path in tmp_path.iterdir()] == [name]
-
-
-def test_a_folder_below_a_file_is_refused_before_anything_is_made(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match=f"{tmp_path / 'file'} is no folder"):
-        check_unused(tmp_path / "file" / "a" / "out")
-    check_unused(tmp_path / "a" / "out")
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_a_folder_is_named_after_the_recording_and_numbered(

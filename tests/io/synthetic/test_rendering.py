@@ -11,9 +11,6 @@ from scipy.spatial.transform import Rotation
 from gvo.geometry.camera import PinholeCamera
 from gvo.geometry.se3 import make_transform
 from gvo.io.synthetic import Light, Rectangle, StillScene, Texture, make_scene
-from gvo.io.synthetic.worlds.motion import drive, look_around
-from gvo.io.synthetic.worlds.room import room
-from gvo.io.synthetic.worlds.street import street
 from gvo.types import DepthArray, FloatArray
 
 CAMERA = PinholeCamera(fx=50.0, fy=55.0, cx=31.3, cy=23.6, width=64, height=48)
@@ -95,52 +92,11 @@ def test_depth_is_that_of_rays_intersected_one_by_one(angles: Triple, position: 
     np.testing.assert_allclose(depth[is_clear], expected[is_clear], rtol=2e-6)
 
 
-def test_the_ground_under_the_camera_is_seen_to_the_lower_edge_of_the_image() -> None:
-    ground = Rectangle(corner=(-50, 1.5, 50), edge_s=(100, 0, 0), edge_t=(0, 0, -100), texture="t")
-    depth = depth_of(scene_of(ground))
-    expected = 1.5 * CAMERA.fy / (np.arange(CAMERA.height)[30:] - CAMERA.cy)
-    np.testing.assert_allclose(depth[30:], np.broadcast_to(expected[:, None], (18, 64)), rtol=1e-6)
-    assert np.all(np.isnan(depth[:24]))
-
-
-@pytest.mark.parametrize(("build", "move"), [(street, drive), (room, look_around)])
-def test_in_a_whole_world_nothing_is_nearer_than_what_is_seen(build: Any, move: Any) -> None:
-    scene, T_map_cam = build(0), move(np.array([3.1]))[0]
-    camera = PinholeCamera(fx=500.0, fy=500.0, cx=420.0, cy=180.0, width=840, height=360)
-    depth = depth_of(StillScene(scene), T_map_cam, camera)
-    v, u = np.random.default_rng(0).integers(0, (360, 840), (150, 2)).T
-    rays = camera.unproject(np.stack([u, v], axis=1).astype(float)) @ T_map_cam[:3, :3].T
-    to_origins = scene.origins - T_map_cam[:3, 3]
-    normals = np.cross(scene.axes_s, scene.axes_t)
-    slopes = rays @ normals.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        z = np.sum(normals * to_origins, axis=1) / slopes
-    hits = rays[:, np.newaxis] * z[..., np.newaxis] - to_origins
-    is_hit = (z > 0) & ((slopes > 0) | scene.is_two_sided) & ~scene.has_mask
-    for axes, sizes in ((scene.axes_s, scene.sizes[:, 0]), (scene.axes_t, scene.sizes[:, 1])):
-        along = np.sum(hits * axes, axis=-1)
-        is_hit &= (along >= 0) & (along <= sizes)
-    nearest = np.where(is_hit, z, np.inf).min(axis=1)
-    seen = depth[v, u]
-    assert np.all(seen <= nearest * (1 + 1e-5))
-    assert np.mean(np.abs(seen - nearest) < 1e-5 * nearest) > 0.8  # the rest: behind cut-outs
-
-
 def test_a_surface_is_not_seen_from_behind_unless_it_has_two_sides() -> None:
     turned = make_transform(np.diag([-1.0, 1.0, -1.0]), np.array([0.0, 0.0, 5.0]))
     for is_two_sided in (False, True):
         scene = scene_of(screen(2.0, is_two_sided=is_two_sided))
         assert np.any(np.isfinite(depth_of(scene, turned))) == is_two_sided
-
-
-@pytest.mark.parametrize("depth", [4.0, 15.0])
-def test_far_textures_are_averaged_not_sampled(depth: float) -> None:
-    scene = scene_of(screen(depth, half=100.0), t=noise_texture())
-    image = image_of(scene)
-    texels_per_pixel = 64 * depth / CAMERA.fx
-    near_std, mean = noise_texture().pixels.std(), noise_texture().pixels.mean()
-    assert abs(image.mean() - mean) < 2.5
-    assert image.std() < 1.6 * near_std / texels_per_pixel
 
 
 @pytest.mark.parametrize("axis", [0, 1])

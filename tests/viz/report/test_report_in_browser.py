@@ -9,7 +9,6 @@ from gvo.io.run_folder.reader import read_run
 from gvo.io.synthetic import SyntheticRecording
 from gvo.viz.report import write_run_report
 from tests.conftest import run_of
-from tests.make.long_run import make_long_run
 from tests.viz.browser import Browser
 from tests.viz.browser_checks import changed_share, cut_texts, n_colours, overlapping_texts
 
@@ -38,25 +37,12 @@ return [...document.querySelectorAll('.panel > svg text')]
 
 
 @pytest.fixture(scope="module")
-def short_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("short")
     source = SyntheticRecording("handheld", "rgbd", n_frames=20, scale=0.5)
     run_of(source, out)
     write_run_report(out / "report.html", read_run(out))
     return out / "report.html"
-
-
-@pytest.fixture(scope="module")
-def long_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("long")
-    write_run_report(out / "report.html", make_long_run(out, 3_500))
-    return out / "report.html"
-
-
-@pytest.fixture(params=["short", pytest.param("long", marks=pytest.mark.acceptance)])
-def report(request: pytest.FixtureRequest) -> Path:
-    path: Path = request.getfixturevalue(f"{request.param}_report")
-    return path
 
 
 def _shown(browser: Browser) -> dict[str, int]:
@@ -80,8 +66,8 @@ def test_the_report_stands_alone_and_shows_every_plot(browser: Browser, report: 
     assert min(shown.values()) >= 1, f"not to be seen: {shown}"
 
 
-def test_on_a_narrow_screen_plots_can_be_read(browser: Browser, short_report: Path) -> None:
-    browser.open_file(short_report)
+def test_on_a_narrow_screen_plots_can_be_read(browser: Browser, report: Path) -> None:
+    browser.open_file(report)
     narrow = {"width": 420, "height": 900, "deviceScaleFactor": 1, "mobile": False}
     browser.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", narrow)
     try:
