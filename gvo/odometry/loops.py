@@ -36,9 +36,8 @@ _N_BESIDE = 2
 _AGREEMENT = 5.0
 _DRIFT = 0.02
 # In a part that nothing connects with the first one, so many frames search all others; later ones
-# with growing pauses of at most so many frames.
+# where they are places.
 _N_EAGER = 15
-_MAX_PAUSE = 30
 _UNCONFIRMED = "no other loop confirms it"
 _AMBIGUOUS = "it fits several places"
 
@@ -90,35 +89,27 @@ class LoopDetector:
     ) -> None:
         if frontend is None and camera is None:
             raise ValueError("LoopDetector needs a camera, or a front-end (frontend=...)")
-        self._follow(frontend or make_frontend(camera, config))  # type: ignore[arg-type]
-        self._index = PlaceIndex()
-        # By their stamps; those of the index in its order; the latest ones, which it has not.
-        self._visits: dict[int, _Visit] = {}
-        self._indexed: list[_Visit] = []
-        self._recent: list[_Visit] = []
+        self._frontend: Any = frontend or make_frontend(camera, config)  # type: ignore[arg-type]
         self._graph = graph
-        # Of the frame that is looked at.
-        self._part = 0
-        self._n_searches: dict[int, int] = {}
-        self._n_paused = 0
-        # Those that a later one may confirm begin there.
+        self._part = 0  # of the frame that is looked at
+        self._n_eager: dict[int, int] = {}  # frames of a part that are still to search eagerly
+        # Those that a later one may confirm begin at a number.
         self.loops: list[Loop] = []
         self._n_settled = 0
         self.variance_factor = 1.0
+        self.forget_places()
 
     def reconfigure(self, frontend: Recognizer) -> None:
         """Go on with another front-end."""
-        self._follow(frontend)
+        self._frontend = frontend
 
     def forget_places(self) -> None:
         """Search no more of the places so far."""
-        self._index, self._visits = PlaceIndex(), {}
-        self._indexed, self._recent = [], []
+        # By their stamps; those of the index in its order; the latest ones, which it has not.
+        self._visits: dict[int, _Visit] = {}
+        self._index, self._indexed = PlaceIndex(), list[_Visit]()
+        self._recent: list[_Visit] = []
         self._n_settled = len(self.loops)
-
-    def _follow(self, frontend: Recognizer) -> None:
-        self._frontend = frontend
-        self._describe_densely = getattr(frontend, "describe_densely", frontend.describe)
 
     def __len__(self) -> int:
         """Return the number of places."""
@@ -160,12 +151,13 @@ class LoopDetector:
         first one, and are places where they are found.
         """
         self._begin_part(part or 0)
-        is_search = self._is_search(T_world_frame)
-        is_place = is_keyframe and not self._shows_latest(T_world_frame)
+        is_place = is_keyframe and not (
+            self._recent and self._shows(T_world_frame, self._recent[-1])
+        )
+        is_search = self._is_search(is_place=is_place)
         if not (is_search or is_place):
             return ()
-        describe = self._describe_densely if is_search else self._frontend.describe
-        place = describe(observations)
+        place = self._describe(observations, is_dense=is_search)
         scores = self._index.scores(place.descriptors_left)
         visits = self._elsewhere(scores) if is_search else self._candidates(scores, near)
         loops = self._register(visits, place, observations, is_search=is_search)
@@ -179,7 +171,12 @@ class LoopDetector:
 
     def keep(self, observations: Any, T_world_frame: FloatArray) -> None:  # noqa: ANN401
         """Add a frame of the latest part as a place, without looking."""
-        self._add(self._describe_densely(observations), T_world_frame)
+        self._add(self._describe(observations, is_dense=True), T_world_frame)
+
+    def _describe(self, observations: Any, *, is_dense: bool) -> Any:  # noqa: ANN401
+        plain = self._frontend.describe
+        describe = getattr(self._frontend, "describe_densely", plain) if is_dense else plain
+        return describe(observations)
 
     def _add(self, place: Any, T_world_frame: FloatArray) -> None:  # noqa: ANN401
         visit = _Visit(place=place, T_world_frame=T_world_frame)
@@ -209,20 +206,17 @@ class LoopDetector:
             while self._recent:
                 self._keep_oldest_recent()
 
-    def _is_search(self, T_world_frame: FloatArray) -> bool:
-        """Tell whether a frame searches all other parts: eagerly at first, then ever more rarely.
+    def _is_search(self, *, is_place: bool) -> bool:
+        """Tell whether a frame searches all other parts: eagerly at first, then if it is a place.
 
         A frame that shows what another one showed would only repeat it.
         """
         part = self._part
         if not self._visits or part == self._part_of(next(iter(self._visits))):
             return False
-        n_searches = self._n_searches.setdefault(part, 0)
-        self._n_paused += 1
-        if self._n_paused <= min(n_searches - _N_EAGER, _MAX_PAUSE):
-            return False
-        self._n_searches[part], self._n_paused = n_searches + 1, 0
-        return True
+        n_eager = self._n_eager.get(part, _N_EAGER)
+        self._n_eager[part] = max(n_eager - 1, 0)
+        return is_place or n_eager > 0
 
     def _register(
         self,
@@ -233,25 +227,24 @@ class LoopDetector:
         is_search: bool = False,
     ) -> list[Loop]:
         """Return the first loop; of a search all, since they may contradict each other."""
-        loops = []
+        loops = list[Loop]()
         for visit in visits:
             result = self._frontend.recognize(visit.place, place, observations)
             if isinstance(result, RelativePose):
-                loops.append(self._loop(visit, place, result))
+                loops.append(
+                    Loop(
+                        stamp_ns=place.stamp_ns,
+                        reference_ns=visit.place.stamp_ns,
+                        T_reference_frame=result.T_reference_current,
+                        covariance=self.variance_factor * result.covariance,
+                        n_matches=result.n_matches,
+                        n_inliers=result.n_inliers,
+                        reason=_UNCONFIRMED,
+                    )
+                )
                 if not is_search:
                     break
         return loops
-
-    def _loop(self, visit: _Visit, place: Any, result: RelativePose) -> Loop:  # noqa: ANN401
-        return Loop(
-            stamp_ns=place.stamp_ns,
-            reference_ns=visit.place.stamp_ns,
-            T_reference_frame=result.T_reference_current,
-            covariance=self.variance_factor * result.covariance,
-            n_matches=result.n_matches,
-            n_inliers=result.n_inliers,
-            reason=_UNCONFIRMED,
-        )
 
     def _keep_oldest_recent(self) -> None:
         """Add the oldest of the latest places to the index, unless another frame knows it."""
@@ -263,9 +256,6 @@ class LoopDetector:
         else:
             self._index.add(visit.place.descriptors_left)
             self._indexed.append(visit)
-
-    def _shows_latest(self, T_world_frame: FloatArray) -> bool:
-        return bool(self._recent) and self._shows(T_world_frame, self._recent[-1])
 
     def _shows(self, T_world_frame: FloatArray, visit: _Visit) -> bool:
         """Tell whether a frame shows most of a place, by odometry."""
@@ -297,37 +287,34 @@ class LoopDetector:
         contradict it.
         """
         loop = loops[0]
-        if any(self._contradict(loop, other) for other in loops[1:]):
+        if any(self._compare(loop, other) < 0 for other in loops[1:]):
             loop = replace(loop, reason=_AMBIGUOUS)
         waiting_ns = self._recent[-1 - _N_WAITING :][0].place.stamp_ns
-        while (
-            self._n_settled < len(self.loops) and self.loops[self._n_settled].stamp_ns < waiting_ns
-        ):
-            self._n_settled += 1
+        rest = self.loops[self._n_settled :]
+        self._n_settled += sum(1 for _ in takewhile(lambda each: each.stamp_ns < waiting_ns, rest))
         latest = range(self._n_settled, len(self.loops))
-        agreeing = [k for k in latest if self._agree(self.loops[k], loop)]
+        votes = {k: self._compare(self.loops[k], loop) for k in latest}
+        agreeing = [k for k, vote in votes.items() if vote > 0]
         if self._is_apart(loop.reference_ns):
-            n_against = sum(self._contradict(self.loops[k], loop) for k in latest)
             agreeing = [k for k in agreeing if self._allows(self.loops[k])]
-            agreeing = agreeing if len(agreeing) > n_against else []
+            if len(agreeing) <= sum(vote < 0 for vote in votes.values()):
+                agreeing = []
             self._note_search(loop, is_found=bool(agreeing))
-        loop = replace(loop, reason="") if agreeing else loop
         confirmed = [k for k in agreeing if self.loops[k].reason]
+        self.loops.append(replace(loop, reason="") if agreeing else loop)
         for k in confirmed:
             self.loops[k] = replace(self.loops[k], reason="")
-        self.loops.append(loop)
-        return [self.loops[k] for k in confirmed] + [loop] * bool(agreeing)
+        return [self.loops[k] for k in confirmed] + self.loops[-1:] * bool(agreeing)
 
     def _allows(self, loop: Loop) -> bool:
         return self._graph is None or self._graph.allows(loop)
 
     def _note_search(self, loop: Loop, *, is_found: bool) -> None:
         """Search rarely after a loop was found; eagerly while the next frame may confirm one."""
-        n_searches = self._n_searches.get(self._part, 0)
         if is_found:
-            self._n_searches[self._part] = _N_EAGER + _MAX_PAUSE
+            self._n_eager[self._part] = 0
         elif loop.reason != _AMBIGUOUS and self._allows(loop):
-            self._n_searches[self._part] = min(n_searches, _N_EAGER - _N_WAITING)
+            self._n_eager[self._part] = max(self._n_eager.get(self._part, 0), _N_WAITING)
 
     def _confirm_alone(
         self,
@@ -349,37 +336,28 @@ class LoopDetector:
             earlier, later = (other, reference) if is_earlier else (reference, other)
             is_other = not self._shows(self._pose(later), earlier)
             seconds = self._register([other], place, observations) if is_other else []
-            if any(self._agree(second, loop) for second in seconds):
+            if any(self._compare(second, loop) > 0 for second in seconds):
                 self.loops[-1] = replace(loop, reason="")
                 return self.loops[-1:]
         return []
 
-    def _contradict(self, first: Loop, second: Loop) -> bool:
-        """Tell whether two loops between the same parts disagree: one place looks like another."""
-        return self._lead_alike(first, second) and not self._agree(first, second)
+    def _compare(self, first: Loop, second: Loop) -> int:
+        """Tell whether two loops and the odometry between their ends agree (1) or not (-1).
 
-    def _lead_alike(self, first: Loop, second: Loop) -> bool:
-        """Tell whether two loops lead from one part to one part."""
-        return all(
-            self._part_of(a) == self._part_of(b)
-            for a, b in (
-                (first.stamp_ns, second.stamp_ns),
-                (first.reference_ns, second.reference_ns),
-            )
-        )
-
-    def _agree(self, first: Loop, second: Loop) -> bool:
-        """Tell whether two loops and the odometry between their ends agree."""
-        is_ambiguous = _AMBIGUOUS in (first.reason, second.reason)
-        if is_ambiguous or not self._lead_alike(first, second):
-            return False
+        0: they do not lead from one part to one part. An ambiguous one agrees with none.
+        """
+        ends = (first.stamp_ns, second.stamp_ns), (first.reference_ns, second.reference_ns)
+        if any(self._part_of(a) != self._part_of(b) for a, b in ends):
+            return 0
+        if _AMBIGUOUS in (first.reason, second.reason):
+            return -1
         T_first_second, drift = self._way(first.stamp_ns, second.stamp_ns)
         T_references, other_drift = self._way(first.reference_ns, second.reference_ns)
         T_expected = se3.invert(T_references) @ first.T_reference_frame @ T_first_second
         difference = se3.log(se3.invert(T_expected) @ second.T_reference_frame)
         Ad = se3.adjoint(se3.invert(T_first_second))
         covariance = Ad @ first.covariance @ Ad.T + second.covariance + np.diag(drift + other_drift)
-        return bool(se3.mahalanobis(difference, covariance) <= _AGREEMENT**2)
+        return 1 if se3.mahalanobis(difference, covariance) <= _AGREEMENT**2 else -1
 
     def _way(self, first_ns: int, second_ns: int) -> tuple[FloatArray, FloatArray]:
         """Return the motion between two places by odometry, and variances of its drift (6,)."""
