@@ -110,12 +110,6 @@ def test_those_seen_least_recently_are_released_and_of_these_the_least_in_view()
     assert choose_unseen(scores, seen_at, 3) == [3, 2, 4]
 
 
-def test_frames_need_no_order_of_their_own() -> None:
-    scores = {"zebra": 0.4, "ape": 0.9, ("a", 1): 0.9}
-    assert choose(scores, exclude="none") == (["ape", ("a", 1)], [])
-    assert choose_released(scores, configure(n_keyframes=1), n_kept=3) == ["zebra", "ape"]
-
-
 @given(
     scores=st.dictionaries(st.integers(0, 50), st.floats(0.0, 1.0), max_size=12),
     n_links=st.integers(1, 8),

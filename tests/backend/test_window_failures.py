@@ -119,15 +119,6 @@ def test_one_failing_update_is_undone_and_its_pose_coasts(
     assert "\n" not in line
 
 
-@pytest.mark.parametrize("n_failures", [3, 4, 10, 10_000])
-def test_nothing_is_lost_when_updates_fail_many_times_in_a_row(n_failures: int) -> None:
-    found, failed = run_failing("update", range(n_failures))
-    assert len(failed) >= min(n_failures, N - FAULTY)
-    assert_complete(found)
-    assert found.window.counts.n_poses == N
-    assert found.window.counts.n_restored >= 1
-
-
 @settings(max_examples=15, suppress_health_check=[HealthCheck.too_slow])
 @given(calls=st.sets(st.integers(0, 60), min_size=1))
 def test_nothing_is_lost_wherever_updates_fail(calls: set[int]) -> None:

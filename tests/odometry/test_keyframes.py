@@ -54,10 +54,6 @@ def test_the_overlap_is_the_share_of_the_points_still_in_view(share: float, n: i
     assert scores[7] == pytest.approx(expected, abs=0.15)
 
 
-def test_the_view_that_has_not_moved_overlaps_fully() -> None:
-    assert keyframes(7).scores({7: np.eye(4)}, 1) == {7: 1.0}
-
-
 def test_points_behind_the_camera_are_not_in_view() -> None:
     assert keyframes(7).scores({7: np.diag([-1.0, 1.0, -1.0, 1.0])}, 1) == {7: 0.0}
     assert keyframes(7).scores({7: shifted(dz=-5.0)}, 1) == {7: 0.0}

@@ -14,7 +14,6 @@ from gvo.errors import SmoothingError
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.odometry.odometry import Odometry
-from gvo.odometry.path import Parts
 from gvo.types import (
     Failure,
     FloatArray,
@@ -308,17 +307,6 @@ def test_keyframes_that_wait_are_no_more_than_those_in_use() -> None:
     results = run(Beacon(see=lambda _: None), places)
     assert results[-1].segment == 5
     assert max(len(result.keyframes_ns) for result in results) <= 2 * 4
-
-
-def test_parts_that_are_joined_to_the_same_one_are_joined_to_each_other() -> None:
-    parts = Parts()
-    for n in (0, 10, 20, 30):
-        parts.add(n)
-        parts.add(n + 1, [n])
-    assert [parts.of(n) for n in (1, 11, 21, 31, 99)] == [0, 10, 20, 30, 99]
-    parts.join(31, 1)
-    parts.add(32, [31, 11])
-    assert [parts.of(n) for n in (1, 11, 21, 31, 32)] == [0, 0, 20, 0, 0]
 
 
 def test_what_was_seen_last_is_known_again_though_it_is_no_keyframe() -> None:
