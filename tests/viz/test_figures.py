@@ -6,11 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gvo.geometry import se3
-from gvo.trajectory.evaluation import Consistency
 from gvo.trajectory.trajectory import Trajectory
-from gvo.viz.figures import broken, gaps_before, style
+from gvo.viz.figures import broken, gaps_before
 from gvo.viz.report.paths import lines_of
-from gvo.viz.report.plots import covariance_plot
 
 
 @given(st.integers(2, 50), st.integers(1, 49))
@@ -35,22 +33,3 @@ def test_long_paths_become_short_ones_that_keep_their_gaps(n: int, n_gaps: int) 
     assert np.count_nonzero(np.isnan(line.points[:, 0])) == n_gaps
     if n:
         np.testing.assert_array_equal(line.points[[0, -1]], positions[[0, -1]])
-
-
-def test_no_label_of_errors_within_their_covariances_is_cut() -> None:
-    n = 100
-    end_ns = np.arange(n, dtype=np.int64) * 100_000_000 + 1_000_000_000
-    sigmas = np.array([1e-4, 1e-4, 1e-4, 2.88e-3, 2.88e-3, 2.88e-3])
-    item = Consistency(
-        name="raw over 1 s",
-        start_ns=end_ns - 1_000_000_000,
-        end_ns=end_ns,
-        errors=np.zeros((n, 6)),
-        covariances=np.tile(np.diag(sigmas**2), (n, 1, 1)),
-    )
-    with style():
-        figure = covariance_plot(item, 0).figure
-        assert figure is not None
-        figure.draw_without_rendering()  # type: ignore[no-untyped-call,unused-ignore]
-        lefts = [axes.yaxis.label.get_window_extent().x0 for axes in figure.axes]
-    assert min(lefts) > 0.0

@@ -1,7 +1,5 @@
 """Matches drawn over images."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -20,8 +18,7 @@ from gvo.viz.overlay import (
     draw_matches,
     table,
 )
-from gvo.viz.scene import loop_text
-from tests.make.results import estimate_at, loop_of, result_of
+from tests.make.results import estimate_at, result_of
 
 _GREY = np.random.default_rng(0).integers(60, 120, (80, 120), dtype=np.uint8)
 _pixels = st.tuples(st.floats(-30, 150), st.floats(-30, 110))
@@ -160,19 +157,3 @@ def test_depth_has_the_colours_of_the_bar_and_what_is_unknown_is_dark() -> None:
     shares = (np.array(places) - left) / (right - left)
     np.testing.assert_allclose(shares, np.log([0.5 / 0.4, 2.0 / 0.4]) / np.log(20.0), atol=0.02)
     np.testing.assert_array_equal(panel[60, 600], (255, 255, 255))
-
-
-def test_a_loop_has_its_mark_in_the_upper_right_corner_and_leaves_the_stamp_readable() -> None:
-    loop = loop_of(10**18, 10**18 - 98_765_400_000_000)
-    plain = _result([], [], status=Status.RESUMED)
-    marked = replace(plain, loops=(loop,))
-    assert loop_text(plain) == ""
-    assert loop_text(marked) == "loop to 98765.4 s before, 87 inliers"
-    before, after = (
-        compose_overlay(_pair(), each, _STEREO, index=99_999, max_width=640).astype(int)
-        for each in (plain, marked)
-    )
-    rows, columns = np.nonzero(np.abs(after - before).sum(axis=2))
-    assert rows.max() < 24
-    assert columns.max() >= 620
-    assert not before[:24, columns.min() - 4 :].any()

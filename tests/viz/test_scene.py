@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from gvo.geometry import se3
 from gvo.types import Estimate
 from gvo.viz.scene import (
-    GLOBAL,
     History,
     Track,
     ellipsoids,
@@ -77,40 +76,6 @@ def test_a_scene_names_what_is_drawn() -> None:
     assert scene(first, alone).lines == {}
     assert seen.caption[0].startswith("ok: 95 of 105 matches are inliers")
     assert "loop to 0.4 s before" in seen.caption[1]
-
-
-def test_keyframes_and_links_are_where_the_window_has_them() -> None:
-    history = history_of(3)
-    moved = [estimate_at(PERIOD_NS * k, pose_of(k + 10)) for k in (0, 2)]
-    history.correct(moved)
-    result = result_of(3)
-    history.add(result)
-    seen = scene(result, history)
-    assert [each.T_world_frame[2, 3] for each in seen.keyframes] == [10.0]
-    np.testing.assert_array_equal(seen.lines["step"][:, :, 2], [[12.0, 3.0]])
-    smoothed = history.paths()["smoothed"]
-    np.testing.assert_array_equal(smoothed[1][:, 2], [10.0, 12.0])
-
-
-def test_paths_come_with_each_full_second_and_recent_positions_since() -> None:
-    history = History()
-    for index in range(35):
-        result = result_of(index)
-        history.add(result)
-        seen = scene(result, history)
-        assert (len(seen.paths) > 0) == (index in (10, 20, 30))
-        start = max(0, index // 10 * 10)
-        expected = np.arange(start, index + 1, dtype=float)
-        np.testing.assert_array_equal(seen.recent["raw"][:, 2], expected)
-
-
-def test_loops_that_do_not_count_or_whose_places_are_unknown_are_not_drawn() -> None:
-    history = history_of(3)
-    history.add_late(GLOBAL, [estimate_at(PERIOD_NS * k, pose_of(2 * k)) for k in range(3)])
-    end_ns = 2 * PERIOD_NS
-    loops = loop_of(end_ns, 0), loop_of(end_ns, 7), loop_of(end_ns, 0, "contradicts the others")
-    lines = history.tracks[GLOBAL].lines(loops)
-    np.testing.assert_array_equal(lines[:, :, 2], [[4.0, 0.0]])
 
 
 def test_points_that_are_not_finite_are_left_out_and_pixels_may_be_unknown() -> None:

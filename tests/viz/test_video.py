@@ -67,14 +67,6 @@ def test_a_film_plays_as_fast_as_it_was_taken(tmp_path: Path, suffix: str, rate_
     np.testing.assert_allclose(np.diff(stamps_ms), 1e3 / rate_hz, rtol=2e-3, atol=1.0)
 
 
-def test_a_gap_in_the_stamps_does_not_change_the_rate(tmp_path: Path) -> None:
-    film = Film(tmp_path / "film.mp4")
-    for n, level in enumerate(_LEVELS):
-        film.add(_picture(level), n * 10**8 + (n > 2) * 5 * _SECOND_NS)
-    film.close()
-    assert cv2.VideoCapture(str(film.path)).get(cv2.CAP_PROP_FPS) == pytest.approx(10.0)
-
-
 @_SUFFIXES
 def test_a_single_picture_makes_a_film_and_none_makes_no_file(tmp_path: Path, suffix: str) -> None:
     film = Film(tmp_path / f"one{suffix}")

@@ -99,14 +99,6 @@ class ViewPage:
         self.field(label).send_keys(Keys.CONTROL, "a")
         self.browser.driver.execute_cdp_cmd("Input.insertText", {"text": value})
 
-    def move_slider(self, label: str, n_steps: int) -> None:
-        from selenium.webdriver import Keys
-
-        thumb = self.control(label).find_element("css selector", "[role=slider]")
-        key = Keys.ARROW_RIGHT if n_steps > 0 else Keys.ARROW_LEFT
-        for _ in range(abs(n_steps)):
-            thumb.send_keys(key)
-
     def canvas(self) -> "WebElement":
         return max(self.browser.all("canvas"), key=lambda canvas: canvas.size["width"])
 

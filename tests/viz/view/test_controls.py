@@ -5,12 +5,9 @@ from typing import Any
 
 import pytest
 import viser
-import yaml
 
 from gvo.config import (
     Config,
-    Parameter,
-    describe_configuration,
     list_parameters,
     load_configuration,
 )
@@ -19,7 +16,6 @@ from gvo.viz.view.controls import ParameterControls
 from gvo.viz.view.server import open_server, silence
 
 PARAMETERS = [parameter for group in list_parameters().values() for parameter in group]
-SCHEMA = Config.model_json_schema()
 
 
 @pytest.fixture(scope="module")
@@ -118,40 +114,6 @@ def test_what_is_refused_is_told_on_one_line_and_goes_back(
     assert desk.controls.config == Config()
     desk.controls.flush()  # with the next press of a button the line goes
     assert desk.said[-1] == ""
-
-
-def test_a_configuration_beyond_the_sliders_is_kept(server: viser.ViserServer) -> None:
-    server.gui.reset()
-    config = load_configuration(settings=["temporal.max_distance=0.0012", "window.gate=null"])
-    desk = Desk(server.gui, config)
-    desk.set("klt", "n_corners", 60)
-    assert desk.applied[-1].temporal.max_distance == 0.0012
-    assert desk.applied[-1].window.gate is None
-
-
-def schema_of(parameter: Parameter) -> dict[str, Any]:
-    """The range of a parameter as pydantic states it in its JSON schema."""
-    section = SCHEMA["$defs"][SCHEMA["properties"][parameter.section]["$ref"].split("/")[-1]]
-    described = section["properties"][parameter.key]
-    plain = [option for option in described.get("anyOf", []) if option.get("type") != "null"]
-    return {**described, **(plain[0] if plain else {})}
-
-
-def test_names_ranges_and_hints_are_those_of_the_configuration() -> None:
-    described = yaml.safe_load(describe_configuration(Config()))
-    keys = sorted((section, key) for section, group in described.items() for key in group)
-    assert sorted((parameter.section, parameter.key) for parameter in PARAMETERS) == keys
-    for parameter in PARAMETERS:
-        schema = schema_of(parameter)
-        lowest = schema.get("minimum", schema.get("exclusiveMinimum"))
-        assert (parameter.minimum is None) == (lowest is None), parameter
-        assert parameter.maximum == schema.get("maximum"), parameter
-        if lowest is not None:
-            assert lowest <= parameter.minimum <= lowest + parameter.step, parameter
-        assert schema["description"] in parameter.hint
-        assert schema.get("unit", "") in parameter.hint
-        default = "null" if parameter.default is None else f"{parameter.default}".lower()
-        assert yaml.safe_load(parameter.hint.rpartition("default ")[2]) == yaml.safe_load(default)
 
 
 def test_the_ends_of_sliders_and_the_start_of_optional_numbers_are_taken() -> None:

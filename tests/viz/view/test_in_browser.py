@@ -1,16 +1,13 @@
 """`gvo view` in a real browser: it plays, a parameter changes the next frame, nothing leaks."""
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-import gvo
 from gvo.config import Config, load_configuration
 from gvo.io.synthetic import SyntheticRecording
 from gvo.viz.view import serve
 from gvo.viz.view.player import Player
-from tests.live.pipe import LiveCommand, names_of, sent_image
 from tests.viz.browser import Browser
 from tests.viz.browser_checks import changed_share, n_colours
 from tests.viz.view.page_driver import ViewPage
@@ -93,45 +90,3 @@ def test_a_parameter_changes_the_next_frame_and_is_saved(page: ViewPage, player:
     page.press("restart")
     page.browser.wait(lambda: player.newest.first_index == 5, message="it does not start again")
     page.wait_for_frame(5)
-
-
-def test_the_page_of_a_running_camera_shows_what_comes_and_sets_parameters(
-    browser: Browser, drive_bag: Path, tmp_path: Path
-) -> None:
-    source = gvo.open_recording(drive_bag)
-    names = names_of(source)
-    images = [sent_image(image, names[image.stream]) for image in source.images()]
-    pairs = [images[index] + images[index + 1] for index in range(0, len(images), 2)]
-    with LiveCommand(source.info, tmp_path, "--view=0") as run:
-        page = ViewPage(browser, run.said("shows the run"))
-        coming = iter(range(N_FRAMES))
-
-        def show_next() -> None:
-            index = next(coming)
-            run.feed(pairs[index])
-            page.wait_for_frame(index)
-
-        for _ in range(3):
-            show_next()
-        before = page.number("keypoints")
-        assert page.cell("status") == "ok"
-        assert n_colours(page.scene()) > 20
-
-        page.unfold("Parameters", "klt")
-        page.type_number("n_corners", "1")  # below its range
-        browser.wait(lambda: "n_corners" in page.cell("message"), message="1 is not refused")
-        page.type_number("n_corners", str(before // 2))
-        browser.wait(lambda: page.cell("message") == "", message="the parameter is not taken")
-        show_next()
-        assert 0 < page.number("keypoints") <= 0.6 * before
-
-        page.press("pause")
-        browser.wait(lambda: page.cell("player") == "paused", message="it does not pause")
-        run.feed(pairs[next(coming)])
-        page.press("play")
-        browser.wait(lambda: page.cell("player") == "playing", message="it does not play")
-        show_next()
-        assert browser.requests_leaving() == []
-        assert browser.console_errors() == []
-        assert run.end() == 0, run.errors
-    assert "6 frames, all tracked" in "".join(run.lines)

@@ -76,16 +76,6 @@ def test_paths_links_and_loops_are_drawn(page: Page, player: FakePlayer) -> None
     assert len(nodes(page, "/ellipsoids/meshes")) == len(nodes(page, "/keyframes/cameras")) == 1
 
 
-def test_a_frame_of_no_points_sends_none_and_those_of_keyframes_stay(
-    page: Page, player: FakePlayer
-) -> None:
-    for index, n_clouds in ((0, 1), (1, 0), (2, 1)):  # browsers complain of an empty one
-        show(page, player, index, n_points=50 * n_clouds)
-        assert len(nodes(page, "/camera/points/")) == n_clouds
-        (cloud,) = nodes(page, "/cloud/")
-        assert len(cloud.points) == 50
-
-
 def test_a_layer_that_is_hidden_stays_so(page: Page, player: FakePlayer) -> None:
     page.drawing.set_visible("raw", False)
     player.show(3)
@@ -174,13 +164,3 @@ def test_the_truth_is_laid_onto_the_estimate_as_far_as_that_has_come(
     np.testing.assert_allclose(positions, spiral()[n_missing:15, :3, 3], atol=1e-6)
     elsewhere = Trajectory(stamps_ns=STAMPS_NS + 10**15, T_world_frame=spiral())
     assert truth_positions(elsewhere, path_of()).shape == (0, 3)
-
-
-def test_a_drift_shows_where_the_first_pose_is_known_and_is_shared_out_where_not() -> None:
-    truth, path = Trajectory(stamps_ns=STAMPS_NS, T_world_frame=spiral()), path_of(scale=1.2)
-    bare = Trajectory.of_positions(STAMPS_NS, truth.positions)
-    laid, fitted = truth_positions(truth, path), truth_positions(bare, path)
-    errors = [np.linalg.norm(path[1][:, :3] - found, axis=1) for found in (laid, fitted)]
-    assert errors[0][0] < 1e-9
-    assert errors[0][-1] > errors[1][-1]
-    assert errors[1][0] > 1e-3

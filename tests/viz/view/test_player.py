@@ -253,22 +253,3 @@ def test_a_recording_that_breaks_off_is_told_and_its_poses_are_there() -> None:
         assert (player.fault, player.is_finished) == ("the file ends here", True)
         assert not player.is_playing
         assert path(player, "smoothed")[0] == stamps_ns()[:6]
-
-
-def test_a_recording_without_a_frame_ends() -> None:
-    with Player(Recording(lambda images: islice(images, 0)).open, Config()) as player:
-        player.step()
-        assert player.wait(LIMIT_S)
-        assert player.is_finished
-        assert player.newest.view() is None
-
-
-def test_a_fault_of_the_program_is_told_and_a_restart_goes_on() -> None:
-    broken = [Recording(break_off(ZeroDivisionError("an odd image"))), Recording()]
-    with Player(lambda config: broken.pop(0), Config()) as player:
-        go(player, N_FRAMES - 1)
-        assert player.fault == "ZeroDivisionError: an odd image"
-        player.restart(0)
-        assert player.wait(LIMIT_S)
-        go(player, 2)
-        assert (player.fault, player.newest.n_done) == ("", 3)

@@ -1,7 +1,6 @@
 """The page is served to this machine alone, serves its own files alone, and ends cleanly."""
 
 import socket
-import sys
 import threading
 from pathlib import Path
 from urllib.parse import quote
@@ -67,12 +66,6 @@ def test_a_taken_port_is_told_nothing_is_printed_and_closing_frees_all(
 def test_an_address_of_another_machine_is_refused() -> None:
     with pytest.raises(ConfigurationError, match=r"--host 192\.0\.2\.1: no address of this"):
         serve(as_player(FakePlayer()), host="192.0.2.1")
-
-
-def test_without_viser_it_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(ConfigurationError, match=r"pip install \S+\[view\]'"):
-        serve(as_player(FakePlayer()))
 
 
 def test_the_page_itself_can_steer_and_another_page_in_the_browser_cannot(page: Page) -> None:
