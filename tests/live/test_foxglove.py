@@ -2,7 +2,6 @@
 
 import base64
 import json
-import socket
 import struct
 import subprocess
 import sys
@@ -296,20 +295,6 @@ def test_the_command_ends_in_one_line_where_the_port_is_taken_or_the_package_mis
     monkeypatch.delitem(sys.modules, "gvo.live.foxglove")
     assert "pip install" in refused(command("live", "-", *options))
     assert not (tmp_path / "out").exists()
-
-
-def test_a_closed_server_lets_go_of_its_port_and_takes_no_harm(server: Foxglove) -> None:
-    parameters = Parameters(Config())
-    server.offer(parameters)
-    publisher = server.advertise("/gvo/note", "std_msgs/msg/String")
-    port = int(server.url.rpartition(":")[2])
-    with Client(server.url) as client, socket.create_connection(("127.0.0.1", port)):
-        server.close()  # while one has said nothing yet
-        assert client.process.wait(_LIMIT_S) is not None
-    publisher.publish(b"\0\1\0\0", 0)
-    parameters.set({"klt.n_corners": 250})
-    server.close()
-    Foxglove(port=port).close()
 
 
 @pytest.mark.acceptance

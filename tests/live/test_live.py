@@ -3,7 +3,6 @@
 import io
 import json
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from gvo.errors import RecordingError
 from gvo.io.recording import StampedImage
 from gvo.io.sync import Pair
 from gvo.live.odometry import LiveOdometry, WaitingPairs
-from gvo.live.sources import Device, StandardInput
+from gvo.live.sources import StandardInput
 from gvo.types import FaultyFrame, Progress
 from tests.conftest import TABLES, Command, assert_same_files, refused
 from tests.live.conftest import N_FRAMES
@@ -45,27 +44,6 @@ def taken(waiting: WaitingPairs) -> list[tuple[int, str]]:
         else:
             found.append((item[0].stamp_ns // MILLISECOND_NS, ""))
     return found
-
-
-def test_the_time_of_reading_is_without_that_of_waiting(drive_bag: Path, tmp_path: Path) -> None:
-    class Late:
-        """A camera with a long exposure."""
-
-        def __init__(self) -> None:
-            self.source = gvo.open_recording(drive_bag)
-            self.info = self.source.info
-
-        def images(self) -> Iterator[StampedImage]:
-            for image in self.source.images():
-                time.sleep(0.03)
-                yield image
-
-        def ground_truth(self) -> None:
-            return None
-
-    ((folder, _),) = LiveOdometry(Late()).run(tmp_path / "out", outputs=NO_REPORT)
-    rows = (folder / "timings.csv").read_text().splitlines()[1:]
-    assert np.median([float(row.split(",")[1]) for row in rows]) < 30
 
 
 def test_for_one_more_the_oldest_is_dropped_and_says_so() -> None:
@@ -121,20 +99,6 @@ def test_the_slowest_frame_of_late_counts_but_the_newest_is_taken() -> None:
 def test_a_queue_of_nothing_is_refused(arguments: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="max_waiting >= 1 and max_lag_s > 0"):
         WaitingPairs(**arguments)
-
-
-def test_a_fault_of_the_stream_comes_after_what_was_received() -> None:
-    waiting = WaitingPairs()
-
-    def received() -> Iterator[Pair]:
-        yield pair(1)
-        raise RecordingError("the cable")
-
-    through = waiting.through(received())
-    assert not isinstance(first := next(through), FaultyFrame)
-    assert first[0].stamp_ns == MILLISECOND_NS
-    with pytest.raises(RecordingError, match="the cable"):
-        next(through)
 
 
 @pytest.mark.parametrize(("name", "compressed"), [("drive", "png"), ("room", "")])
@@ -277,12 +241,3 @@ def test_what_cannot_be_opened_is_refused(
     said = refused(command("live", *live(*words, calibration=one, out=tmp_path / "out")))
     assert fault in said
     assert not (tmp_path / "out").exists()
-
-
-def test_a_device_lets_go_of_its_cameras(films: Path, drive_bag: Path) -> None:
-    info = gvo.open_recording(drive_bag).info
-    device = Device([str(films / "both%03d.png")], info)
-    images = device.images()
-    first = next(images)
-    assert first.load().shape[:2] == (info.calibrations[0].height, info.calibrations[0].width)
-    images.close()  # type: ignore[attr-defined]

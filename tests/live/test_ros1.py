@@ -55,16 +55,16 @@ def live(ros: Ros, out: Path, *options: str) -> Program:
 
 @pytest.mark.acceptance
 @pytest.mark.recorded
-@pytest.mark.parametrize("name", ["kitti_06_start", "rgbd_dataset_freiburg1_xyz_start"])
 def test_what_is_played_is_tracked_as_from_its_files(
-    name: str, ros: Ros, gvo_data: Path, tmp_path: Path
+    ros: Ros, gvo_data: Path, tmp_path: Path
 ) -> None:
-    run_of(gvo_data / name, tmp_path / "run")
+    recording = gvo_data / "kitti_06_start"
+    run_of(recording, tmp_path / "run")
     expected = gvo.read_trajectory(tmp_path / "run" / "causal.txt")
     odometry = live(ros, tmp_path / "out")
     watcher = ros.start(DRIVER)
     watcher.wait_for("watching")
-    player = ros.start(PLAYER, gvo_data / name)
+    player = ros.start(PLAYER, recording)
     player.wait_for("pairs sent")
     assert player.end() == 0
     assert odometry.interrupt() == 0, odometry.errors
