@@ -4,15 +4,12 @@ import re
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
-from typing import get_args
 
 import pytest
 from typer.main import get_command
 
 import gvo
 from gvo.cli.main import app
-from gvo.io.recording import Sensor
-from gvo.trajectory.evaluation import Consistency
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -55,31 +52,8 @@ def test_commands_and_options_within_sentences_are_there(page: Path) -> None:
     assert [span for span in spans(page) if unknown(span)] == []
 
 
-def compared() -> dict[str, tuple[str, str]]:
-    """Return the comparison with others: what each has, and what gvo has."""
-    section = README.partition("\n## Beside others\n")[2].partition("\n## ")[0]
-    row = re.compile(r"^\| \[(.+?)\]\(https://github\.com/\S+/\S+\) \| (.+) \| (.+) \|$", re.M)
-    rows = {name: (theirs, ours) for name, theirs, ours in row.findall(section)}
-    assert len(rows) == section.count("\n| [")
-    return rows
-
-
 def claims(cell: str) -> set[str]:
     return {*re.split(r"[,;] ", cell)}
-
-
-def test_the_readme_compares_gvo_with_others_in_both_directions() -> None:
-    rows = compared()
-    assert {"ORB-SLAM3", "RTAB-Map", "KISS-ICP", "evo"} <= {*rows}
-    for theirs, ours in rows.values():
-        assert claims(theirs)
-        assert claims(ours)
-        assert not claims(theirs) & claims(ours)
-
-
-def takes(*words: str) -> Callable[[], bool]:
-    """Return whether gvo needs nothing of such a name to be installed."""
-    return lambda: not any(word in need for need in PROJECT["dependencies"] for word in words)
 
 
 def has(*names: str) -> Callable[[], bool]:
@@ -91,38 +65,6 @@ def has(*names: str) -> Callable[[], bool]:
         return name in COMMANDS or name in gvo.__all__
 
     return lambda: all(map(is_there, names))
-
-
-EVIDENCE: dict[str, Callable[[], bool]] = {
-    "covariances of its poses": lambda: "covariance" in gvo.Estimate.__dataclass_fields__,
-    "estimated covariances": lambda: "covariance" in gvo.Estimate.__dataclass_fields__,
-    "one `pip install`": lambda: "&& pip install . &&" in README,
-    "bags without ROS": takes("rclpy", "rospy"),
-    "bags and live topics without an installation of ROS 2": has("live", "gvo/live/dds.py"),
-    "a licence without copyleft": lambda: PROJECT["license"] == "MIT",
-    "a frame explained step by step": has("explain"),
-    "cameras": has("StereoFrame", "RgbdFrame"),
-    "a smoother (it takes KISS-ICP's poses)": has(
-        "SlidingWindow", "smooth", "scripts/smooth_pose_stream.py"
-    ),
-    "no GPU needed": takes("torch", "cuda", "cupy"),
-    "odometry itself": has("run", "Odometry"),
-    "covariances compared with errors": lambda: hasattr(Consistency, "mean_nees"),
-    "KITTI's segment errors": lambda: "segments_m" in gvo.Evaluation.__dataclass_fields__,
-}
-"""What shows a claim of the comparison."""
-
-
-def test_what_the_readme_claims_of_gvo_beside_others_is_there() -> None:
-    claimed = set().union(*(claims(ours) for _, ours in compared().values()))
-    assert claimed == {*EVIDENCE}
-    assert [claim for claim in sorted(claimed) if not EVIDENCE[claim]()] == []
-
-
-def test_what_the_readme_says_that_gvo_has_not_is_not_there() -> None:
-    assert "it has no IMU, no monocular mode and no maps that\nare kept" in README
-    assert get_args(Sensor) == ("stereo", "rgbd")
-    assert not any(re.search("I(?:mu|MU)|Mono|Lidar|LiDAR", name) for name in gvo.__all__)
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/installation.md"])

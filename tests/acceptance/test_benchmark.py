@@ -13,15 +13,11 @@ import gvo
 from gvo.io.recording import Source
 from gvo.testing.faults import Black, FaultySource
 from gvo.types import FaultyFrame
-from scripts.benchmarks import recordings
-from tests import worlds
 from tests.acceptance.conftest import Script
 from tests.conftest import run_of
 
 pytestmark = pytest.mark.acceptance
 
-ROOT = Path(__file__).parents[2]
-N_FRAMES = 34  # just over a second, which the NEES needs
 Benchmark = Callable[..., str]
 
 
@@ -80,39 +76,6 @@ def test_errors_of_recordings_are_those_of_a_run(
     for name, bag in zip(("drive", "room"), (drive_bag, room_bag), strict=True):
         assert_close(rows[name][1:4], ates_m(gvo.open_recording(bag)))
     assert [len(row) for row in table(printed, "recording", 1).values()] == [4, 4]
-
-
-def test_errors_of_seeds_are_printed_again_from_the_kept_bags(
-    benchmark: Benchmark, tmp_path: Path
-) -> None:
-    options = ["--frames", N_FRAMES, "--kind", "room", "--readout", 20]
-    options += ["--scale", 0.3, "--keep", tmp_path / "kept"]
-    printed = benchmark("errors", "--seeds", "3-4", *options)
-    rows = table(printed, "seed")
-    assert list(rows) == ["3", "4", "median", "worst"]
-    paths = sorted((tmp_path / "kept").iterdir())
-    kept = [gvo.open_recording(path) for path in paths]
-    for seed, recording in zip((3, 4), kept, strict=True):
-        rendered = gvo.SyntheticRecording(
-            "handheld", "rgbd", n_frames=N_FRAMES, seed=seed, scale=0.3, readout_ms=20.0
-        )
-        for one, other in zip(islice(rendered.images(), 4), recording.images(), strict=False):
-            np.testing.assert_array_equal(one.load(), other.load())
-    expected = np.array([ates_m(recording)[::2] for recording in kept])
-    for name, ates in zip(("3", "4"), expected, strict=True):
-        assert_close(rows[name][4:6], ates)
-    n_better = np.count_nonzero(expected[:, 1] <= expected[:, 0])
-    assert printed.endswith(f"smoothed ATE <= raw ATE on {n_better} of 2\n")
-    # The raw chain and the window hold poses a second apart, not ten.
-    assert ["-" in rows["3"][column] for column in (6, 7, 8, 9)] == [False, True, False, True]
-    written = {path: path.stat().st_mtime_ns for path in paths}
-    again = benchmark("errors", "--seeds", "3-3", *options)
-    assert table(again, "seed")["3"] == rows["3"]
-    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "kept").iterdir()} == written
-
-
-def test_the_kinds_show_all_worlds() -> None:
-    assert {kind.world for kind in recordings.KINDS.values()} == set(worlds.KINDS)
 
 
 def test_the_cost_of_a_run_is_told_beside_the_yardstick(

@@ -5,16 +5,14 @@ import importlib
 import re
 import shlex
 import shutil
+from functools import partial
 from pathlib import Path
 
 import pytest
+from distributed import LocalCluster
 
 import gvo
 from gvo.config import Config, describe_configuration
-from gvo.diagnostics.check.limits import RULES
-from gvo.geometry.lens import N_COEFFICIENTS
-from gvo.io.bag.image_encodings import DEPTHS, IMAGES
-from gvo.io.bag.reader import BagReader
 from gvo.runs.demo import write_robot_bag
 from tests.conftest import Command
 
@@ -96,6 +94,7 @@ def test_examples_in_docstrings_run(name: str) -> None:
     assert doctest.testmod(importlib.import_module(name)).failed == 0
 
 
+@pytest.mark.usefixtures("undrawn_reports", "workers_in_this_process")
 @pytest.mark.parametrize(("page", "code"), blocks("python"))
 def test_python_in_the_documentation_runs(workplace: Path, page: str, code: str) -> None:
     exec(compile(code, page, "exec"), {"__name__": "__main__"})
@@ -109,18 +108,21 @@ def page_that_ends(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def undrawn_reports(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave the reports of runs empty, but for those of the first tutorial; to draw takes long."""
+    """Leave the reports of runs empty: to draw takes long."""
     name = "gvo.viz.report.write_run_report"
     monkeypatch.setattr(name, lambda path, *_, **__: Path(path).touch())
 
 
-@pytest.mark.usefixtures("page_that_ends", "clone")
+@pytest.fixture
+def workers_in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let batches start no processes; what they write is the same."""
+    near = partial(LocalCluster, processes=False, dashboard_address="127.0.0.1:0")
+    monkeypatch.setattr("gvo.batch.engine.LocalCluster", lambda **_: near(n_workers=1))
+
+
+@pytest.mark.usefixtures("page_that_ends", "clone", "undrawn_reports", "workers_in_this_process")
 @pytest.mark.parametrize("name", TUTORIALS)
-def test_a_tutorial_works_line_by_line_after_the_demo(
-    command: Command, name: str, request: pytest.FixtureRequest
-) -> None:
-    if name != "index.md":
-        request.getfixturevalue("undrawn_reports")
+def test_a_tutorial_works_line_by_line_after_the_demo(command: Command, name: str) -> None:
     lines = [line for page, text in blocks("sh") if page == name for line in text.splitlines()]
     assert len(lines) >= 5
     for line in lines:
@@ -132,7 +134,7 @@ def test_a_tutorial_works_line_by_line_after_the_demo(
         assert (program, answer.code) == ("gvo", 0), f"{line}: {answer.err}"
 
 
-@pytest.mark.usefixtures("page_that_ends", "undrawn_reports")
+@pytest.mark.usefixtures("page_that_ends", "undrawn_reports", "workers_in_this_process")
 @pytest.mark.parametrize(("page", "lines"), commands())
 def test_commands_in_the_documentation_run(
     workplace: Path, command: Command, page: str, lines: list[str]
@@ -142,46 +144,11 @@ def test_commands_in_the_documentation_run(
         assert answer.code == 0, f"{page}: {line}: {answer.err}"
 
 
-def test_all_encodings_and_lenses_are_listed() -> None:
-    page = (ROOT / "docs/recordings.md").read_text()
-    missing = [name for name in (*IMAGES, *DEPTHS, *N_COEFFICIENTS) if f"`{name}`" not in page]
-    assert missing == []
-
-
-def test_all_lines_of_a_check_are_listed() -> None:
-    page = (ROOT / "docs/recordings.md").read_text()
-    names = [rule.removeprefix("transform ") for rule in RULES]
-    assert [name for name in names if not re.search(rf"`[^`]*\b{name}`", page)] == []
-
-
-def test_all_topics_of_the_bag_of_a_run_are_listed(workplace: Path, command: Command) -> None:
-    assert command("run", "drive.mcap", "--out", "out", "--bag", "run.mcap").code == 0
-    page = (ROOT / "docs/results.md").read_text()
-    rows = [
-        line
-        for line in page.partition("\n## A run as a bag\n")[2].splitlines()
-        if line.startswith("| `/")
-    ]
-    shown = {
-        (name, kind.replace("/", "/msg/"))
-        for _, names, kind, *_ in (row.replace("`", "").split("|") for row in rows)
-        for name, kind in [(name.strip(), kind.strip()) for name in names.split(",")]
-    }
-    shown.remove(("/gvo/loops", "visualization_msgs/msg/Marker"))  # the drive has none
-    assert shown == {(topic.name, topic.type) for topic in BagReader(workplace / "run.mcap").topics}
-
-
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_between_pages_lead_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text()):
         if not target.startswith("http"):
             assert (page.parent / target).exists(), target
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_programs_that_a_page_names_are_there(page: Path) -> None:
-    named = set(re.findall(r"\b(?:gvo|scripts|tests)/[\w/]+\.py\b", page.read_text()))
-    assert [name for name in named if not (ROOT / name).exists()] == []
 
 
 def test_the_reference_has_every_public_name() -> None:

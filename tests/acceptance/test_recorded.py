@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import gvo
-from tests.conftest import TABLES, Command
 from tests.io.conftest import Tiny
 
 KITTI = "kitti_06_start"
@@ -28,11 +27,3 @@ def test_folder_and_bag_give_the_same_frames_and_cameras(
     for camera, copy in zip(folder.info.calibrations, bag.info.calibrations, strict=True):
         for matrix in "KDRP":
             np.testing.assert_array_equal(getattr(camera, matrix), getattr(copy, matrix))
-
-
-def test_folder_and_bag_give_equal_bytes(command: Command, gvo_data: Path, tmp_path: Path) -> None:
-    assert command("convert", gvo_data / KITTI, tmp_path / "bag.mcap").code == 0
-    for out, recording in (("a", gvo_data / KITTI), ("b", tmp_path / "bag.mcap")):
-        assert command("run", recording, "--out", tmp_path / out, "--no-report").code == 0
-    for name in TABLES:
-        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name

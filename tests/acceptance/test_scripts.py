@@ -1,6 +1,5 @@
 """The scripts run as programs, as a reader would copy them."""
 
-import json
 import shlex
 import subprocess
 import sys
@@ -16,6 +15,7 @@ import gvo
 from gvo.geometry import se3
 from tests.acceptance.conftest import SCRIPTS, Script
 from tests.conftest import ENVIRONMENT, GVO, python
+from tests.live.pipe import write_calibration
 
 pytestmark = pytest.mark.acceptance
 
@@ -138,16 +138,7 @@ def test_bad_input_is_told_in_one_line(script: Script, name: str, arguments: str
 
 
 def test_a_recording_is_fed_to_a_live_run(drive_bag: Path, tmp_path: Path) -> None:
-    info = gvo.open_recording(drive_bag).info
-    calibrations = []
-    for side, camera in zip("lr", info.calibrations, strict=True):
-        calibrations.append(tmp_path / f"{side}.yaml")
-        matrices = {"camera_matrix": camera.P[:, :3], "projection_matrix": camera.P}
-        content: dict[str, object] = {
-            name: {"data": [*each.flat]} for name, each in matrices.items()
-        }
-        content |= {"image_width": camera.width, "image_height": camera.height}
-        calibrations[-1].write_text(json.dumps(content))
+    calibrations = write_calibration(gvo.open_recording(drive_bag).info, tmp_path)
     feeder = [sys.executable, *map(str, (SCRIPTS / "feed_recording.py", drive_bag, "--rate=0"))]
     given = [f"--calibration={path}" for path in calibrations]
     options = ["--rectified", "--no-report", "--queue=1000", f"--out={tmp_path / 'out'}", *given]
