@@ -80,19 +80,6 @@ def test_a_run_in_the_frame_of_the_robot_lies_on_its_truth(
     assert json.loads(compared.out)["estimates"][0]["ate_m"] < 0.02
 
 
-def test_the_truth_of_the_camera_and_poses_of_the_robot_are_of_one_motion(
-    command: Command, robot_bag: Path, tmp_path: Path
-) -> None:
-    gvo.convert(Walk(has_truth=True), tmp_path / "walk.mcap")
-    texts = [str(tmp_path / "walk.mcap"), f"{robot_bag}#tf:map:base_link"]
-    for reference, estimate in (texts, texts[::-1]):
-        # the camera's own bag does not know the robot
-        is_brought = reference == texts[0]
-        answer = command("compare", reference, estimate, "--json")
-        assert answer.err.count("tf does not connect the two") == (not is_brought)
-        assert (json.loads(answer.out)["estimates"][0]["rpe_m"] < 1e-3) == is_brought
-
-
 def test_the_initial_pose_moves_all_poses(
     command: Command, walk_bag: Path, walk_run: Path, tmp_path: Path
 ) -> None:
@@ -207,20 +194,3 @@ def test_of_a_cut_bag_what_can_be_read_is_run(
 
 def stamp_ns(header: Any) -> int:
     return int(header.stamp.sec * 10**9 + header.stamp.nanosec)
-
-
-@pytest.mark.recorded
-def test_recorded_chains_of_tf_have_no_error_of_their_own(command: Command, gvo_data: Path) -> None:
-    chains = ["odom:base_link", "map:base_link", "map:camera_link", "odom:base_footprint"]
-    path = gvo_data / "bags/good/nav2_turtlebot.mcap"
-    n_compared = 0
-    for chain in chains:
-        answer = command("compare", f"{path}#tf:{chain}", f"{path}#tf:{chain}", "--json")
-        if answer.code == 2 and "holds no frame" in answer.err:
-            continue
-        (entry,) = json.loads(answer.out)["estimates"]
-        assert entry["n"] > 100
-        assert entry["ate_m"] < 1e-9
-        assert entry["rpe_m"] < 1e-9
-        n_compared += 1
-    assert n_compared >= 1

@@ -1,9 +1,7 @@
 """A signal while a command works: one line says what stands, and how to go on."""
 
 import json
-import os
 import signal
-import threading
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -12,10 +10,8 @@ import gtsam
 import pytest
 
 import gvo
-from gvo.cli.terminal import Work
 from gvo.io.bag.reader import BagMessage
 from gvo.runs.smooth import Smoother
-from gvo.viz import plots
 from gvo.viz.report import run as report
 from tests.conftest import Command, interrupt_at_call, line_of_poses
 
@@ -93,17 +89,6 @@ def test_a_signal_while_the_report_is_drawn_leaves_the_whole_run(
         assert len(gvo.read_trajectory(tmp_path / f"{name}.txt")) == 3
 
 
-def test_a_signal_while_a_picture_is_drawn_ends_at_once(
-    command: Command, interrupt: Interrupt, tmp_path: Path
-) -> None:
-    poses, out = line_of_poses(tmp_path / "poses.txt"), tmp_path / "out"
-    interrupt(plots, "plot_trajectories", 1)
-    answer = command("smooth", poses, "--out", out)
-    assert (answer.code, answer.err) == (143, f"gvo: interrupted; {UNDRAWN.format(out=out)}\n")
-    assert (out / "summary.json").exists()
-    assert not list(out.glob("*.png"))
-
-
 def test_a_signal_while_poses_are_smoothed_leaves_those_before(
     command: Command, interrupt: Interrupt, tmp_path: Path
 ) -> None:
@@ -132,21 +117,3 @@ def test_a_signal_while_a_graph_is_optimized_leaves_the_best_poses(
     assert graph.error(ends[0]) < graph.error(ends[1]) < min(starts.values())
     for name in ("raw", "smoothed"):
         assert len(gvo.read_trajectory(out / f"{name}.txt")) == 27
-
-
-def test_a_second_signal_interrupts_work_that_the_first_one_did_not_end(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    stopped = threading.Event()
-    work = Work("this stands")
-    work.on_signal = stopped.set
-
-    def send_two() -> None:
-        with work:
-            os.kill(os.getpid(), signal.SIGINT)
-            assert stopped.wait(60)
-            os.kill(os.getpid(), signal.SIGINT)
-
-    with pytest.raises(SystemExit, match="130"):
-        send_two()
-    assert capsys.readouterr().err == "gvo: interrupted; this stands\n"

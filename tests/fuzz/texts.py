@@ -12,7 +12,7 @@ from gvo.errors import GvoError
 from gvo.io.calibration.files import read_cameras
 from gvo.io.edges.events import InputFaults
 from gvo.io.edges.lines import parse_line
-from gvo.io.edges.opening import open_edges, parse_sigma
+from gvo.io.edges.opening import parse_sigma
 from gvo.io.edges.pose_graph import PoseGraphSource
 from gvo.io.opening import open_recording
 from gvo.io.poses.base_frame import parse_initial_pose
@@ -131,12 +131,6 @@ def _g2o_file(data: bytes) -> None:
     for _ in source.measurement_lines:
         pass
     source.faults.warnings()
-
-
-def _edge_files(data: bytes) -> None:
-    source = open_edges([write("edges.txt", data)])
-    for _ in islice(source.events(), 1000):
-        pass
 
 
 def _edge_line(data: bytes) -> None:
@@ -284,7 +278,6 @@ TARGETS = (
         name="g2o_lines", run=_g2o_line, seeds=lambda: _lines_of(_GRAPH), documented=(ValueError,)
     ),
     _text(name="g2o_files", run=_g2o_file, seeds=lambda: [_GRAPH]),
-    _text(name="edge_files", run=_edge_files, seeds=lambda: [_GRAPH, _TUM, _KITTI, _EUROC]),
     _text(
         name="edge_lines",
         run=_edge_line,

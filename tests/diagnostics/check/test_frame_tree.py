@@ -68,16 +68,6 @@ def test_a_recording_without_transforms_or_names_is_no_fault() -> None:
     assert look(tree(), "")["tf: camera"].verdict == "unknown"
 
 
-def test_the_ground_truth_of_a_data_set_is_no_second_tree() -> None:
-    buffer = tree()
-    add_transform(buffer, "world", "ground_truth", 0, np.eye(4))
-    assert complaints(look(buffer)) == set()
-    cameras = TfBuffer()
-    add_transform(cameras, "world", "ground_truth", 0, np.eye(4))
-    add_transform(cameras, "left", "right", 0, np.eye(4), is_static=True)
-    assert complaints(look(cameras, "left")) == set()
-
-
 def test_the_tree_is_part_of_a_check() -> None:
     recording = render("handheld", "rgbd")
     names = {finding.name for finding in check(recording, transforms=tree()).findings}

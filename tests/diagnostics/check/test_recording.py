@@ -34,7 +34,6 @@ def planted(fault: Fault, recording: Held) -> FaultySource | Held:
 @pytest.mark.parametrize(
     ("world", "sensor", "seed"),
     [
-        pytest.param("driving", "stereo", 0, marks=pytest.mark.acceptance),
         ("handheld", "stereo", 0),
         ("handheld", "rgbd", 0),
     ],
@@ -179,19 +178,6 @@ def test_faults_of_images_are_found_and_nothing_else(
 ) -> None:
     found = complaints(check(planted(fault, render("handheld", "rgbd"))))
     assert expected <= found <= expected | tolerated
-
-
-@pytest.mark.acceptance
-def test_images_in_another_order_are_not_found_again() -> None:
-    recording = render("driving", "stereo")
-    colour = recording.stream(0)
-    order = np.random.default_rng(3).permutation(len(colour))
-
-    def shuffle(image: Any, number: int) -> Any:
-        return replace(image, load=recording.stream(image.stream)[order[number]].load)
-
-    found = complaints(check(recording.mapped(shuffle)))
-    assert {"left: corners found again", "right: corners found again"} <= found
 
 
 def test_images_that_do_not_decode_are_counted_and_quoted() -> None:

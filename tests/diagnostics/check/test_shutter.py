@@ -32,7 +32,6 @@ def found_in(recording: Any, readout_ms: float | None = None) -> list[Finding]:
 @pytest.mark.parametrize(
     ("readout_ms", "verdict"),
     [
-        pytest.param(None, "info", marks=pytest.mark.acceptance),
         (0.0, "warning"),
         pytest.param(PLANTED_MS, "ok", marks=pytest.mark.acceptance),
     ],

@@ -123,17 +123,6 @@ def test_each_keyframe_has_an_edge_or_the_reason_why_not(kind: str) -> None:
     ]
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_without_a_prediction_the_matches_agree_by_ransac(kind: str) -> None:
-    found = explained(kind, "stereo").registration
-    explanation = explained(kind, "stereo", LAST, "registration.refine=none")
-    unpredicted = explanation.registration
-    assert found is not None
-    assert unpredicted is not None
-    assert (found.is_known, unpredicted.is_known) == (True, False)
-    assert (unpredicted.n_consensus > 0) == (explanation.result.registration is not None)
-
-
 def test_the_offsets_of_the_rig_are_those_that_the_frame_was_measured_with() -> None:
     source = recording("stereo")
     odometry = Odometry(source.info.camera, configuration("klt"))
