@@ -335,8 +335,8 @@ class PoseGraph:
         return self._isam.calculateEstimatePose3(self.poses[frame_id].key)
 
     def pose(self, frame_id: FrameId) -> FloatArray:
-        """Return T_world_frame, shape (4, 4), of a pose of the window."""
-        return self._pose(self.poses[frame_id].key)
+        """Return T_world_frame, shape (4, 4), of a pose; a `ValueError` if it is not there."""
+        return self._pose(self.require(frame_id).key)
 
     def _pose(self, key: int) -> FloatArray:
         return np.asarray(self._isam.calculateEstimatePose3(key).matrix())

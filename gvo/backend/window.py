@@ -300,7 +300,6 @@ class SlidingWindow:
 
     def pose(self, frame_id: FrameId) -> FloatArray:
         """Return T_world_frame, shape (4, 4), of a pose of the window."""
-        self._graph.require(frame_id)
         return self._graph.pose(frame_id)
 
     def poses(self, frame_ids: Iterable[FrameId] | None = None) -> dict[FrameId, FloatArray]:

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -28,6 +28,9 @@ from gvo.odometry.path import Parts, Path, Way, Ways, bent, source_ns
 from gvo.types import Edge, Estimate, FloatArray, Loop, Optimum, PosePrior
 
 _LOGGER = logging.getLogger(__name__)
+
+# Between which frames loops contradict the rest, and the correction of the newest pose.
+_Verdict: TypeAlias = tuple[set[tuple[int, int]], FloatArray]
 
 # The latest frames are not merged: edges to come may start from them.
 _N_RECENT = 100
@@ -211,8 +214,12 @@ class RunGraph:
         self._n_keyframes += 1
         self._is_due = self._is_due or is_looped
         if self._running is not None and self._n_keyframes >= self._due:
-            self._take_over(self._running)
-            self._running = None
+            running, self._running = self._running, None
+            error = running.exception()  # waits
+            if error is None:
+                _, self.T_map_world = running.result()
+            else:
+                _LOGGER.warning("the map is not corrected while the run goes: %s", error)
         if self._running is None and self._is_due and self._n_keyframes >= self._next:
             self._is_due = False
             chain = self._chain(self.loops, self.path.ways())
@@ -221,13 +228,6 @@ class RunGraph:
             pool = ThreadPoolExecutor(1)
             self._running = pool.submit(chain.judge)
             pool.shutdown(wait=False)
-
-    def _take_over(self, running: Future[_Verdict]) -> None:
-        error = running.exception()  # waits
-        if error is None:
-            self.T_map_world = running.result().T_map_world
-        else:
-            _LOGGER.warning("the map is not corrected while the run goes: %s", error)
 
     def _chain(self, loops: Iterable[Loop], ways: Ways) -> _Chain:
         """Return the ends of the confirmed loops that odometry alone allows, as it joins them."""
@@ -270,46 +270,43 @@ class RunGraph:
             replace(each, reason=each.reason or reasons.get(_ends(each), "")) for each in self.loops
         )
         counted = [loop for loop in loops if not loop.reason]
-        if not counted:
-            return self._optimum(self.path.estimates(), loops)
-        frames_ns = sorted(self._neighbours)
-        graph = self._whole(frames_ns, counted)
-        optimizer = BatchOptimizer(graph, start="given")
-        if len(optimizer.numbers) < len(frames_ns):
-            raise SmoothingError(f"a frame has no valid edge: {graph.rejected[0]}")
-        error_before = optimizer.error
-        optimizer.run()
-        covariances = self._variance_factor(counted, ways) * optimizer.covariances()
-        placed = self._place(frames_ns, optimizer.poses(), covariances, ways)
-        return replace(
-            self._optimum(placed, loops),
-            error_before=error_before,
-            error=optimizer.error,
-            n_iterations=optimizer.n_iterations,
-        )
-
-    def _optimum(self, estimates: tuple[Estimate, ...], loops: tuple[Loop, ...]) -> Optimum:
+        estimates, progress = self._fit(counted, ways) if counted else (self.path.estimates(), {})
         poses = {each.stamp_ns: each.T_world_frame for each in estimates}
         edges = ((frame_ns, edge) for (_, frame_ns), ties in self._edges.items() for edge in ties)
+        misfits = [
+            chi2(each.edge, se3.invert(poses[each.reference_ns]) @ poses[each.stamp_ns])
+            for each in loops
+        ]
         return Optimum(
             estimates=estimates,
             frames_ns=tuple(sorted(self._neighbours)),
             edges=tuple(edges),
             loops=loops,
-            residuals=np.sqrt(
-                [
-                    chi2(each.edge, se3.invert(poses[each.reference_ns]) @ poses[each.stamp_ns])
-                    for each in loops
-                ]
-            ),
+            residuals=np.sqrt(misfits),
+            **progress,
         )
+
+    def _fit(
+        self, loops: Sequence[Loop], ways: Ways
+    ) -> tuple[tuple[Estimate, ...], dict[str, Any]]:
+        """Optimize all edges and these loops; return all frames, and how it went."""
+        frames_ns = sorted(self._neighbours)
+        graph = self._whole(frames_ns, loops)
+        optimizer = BatchOptimizer(graph, start="given")
+        if len(optimizer.numbers) < len(frames_ns):
+            raise SmoothingError(f"a frame has no valid edge: {graph.rejected[0]}")
+        progress = {"error_before": optimizer.error}
+        optimizer.run()
+        progress |= {"error": optimizer.error, "n_iterations": optimizer.n_iterations}
+        covariances = self._variance_factor(loops, ways) * optimizer.covariances()
+        return self._place(frames_ns, optimizer.poses(), covariances, ways), progress
 
     def _reasons(self, loops: Sequence[Loop], ways: Ways) -> dict[tuple[int, int], str]:
         """Return why confirmed loops between two frames do not count."""
         chain = self._chain(loops, ways)
         refused = {_ends(loop) for loop in chain.too_far}
         reasons = dict.fromkeys(refused, _TOO_FAR)
-        reasons |= dict.fromkeys(chain.judge().refused, _CONTRADICTS)
+        reasons |= dict.fromkeys(chain.judge()[0], _CONTRADICTS)
         # Such a world repeats itself, and across a gap odometry cannot tell which are false.
         n_confirmed = len(chain.loops) + len(chain.too_far)
         if 2 * len(reasons) > n_confirmed:
@@ -374,13 +371,6 @@ class RunGraph:
         return path.estimates(T, C)
 
 
-class _Verdict(NamedTuple):
-    """Between which frames loops contradict the rest, and the correction of the newest pose."""
-
-    refused: set[tuple[int, int]]
-    T_map_world: FloatArray
-
-
 class _Chain(NamedTuple):
     """The ends of loops, oldest first, the first and the latest frame, and the ways between."""
 
@@ -404,7 +394,7 @@ class _Chain(NamedTuple):
         optimizer = BatchOptimizer(graph, "gnc", start="given")
         optimizer.run()
         refused = {(self.ends_ns[a], self.ends_ns[b]) for a, b, _ in optimizer.refused}
-        return _Verdict(refused, optimizer.poses()[-1] @ se3.invert(self.T_world_ends[-1]))
+        return refused, optimizer.poses()[-1] @ se3.invert(self.T_world_ends[-1])
 
 
 def _graph_of(stamps_ns: Iterable[int], poses: Iterable[FloatArray]) -> WholeGraph:

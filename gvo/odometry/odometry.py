@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias
@@ -208,18 +206,18 @@ class Odometry:
         if self._camera is not None and not self._is_own:
             _check_frame(frame, self._camera)
         watch = Stopwatch()
-        with watch.stage("extract"):
-            self._take_over_configuration()
-            observations = self._frontend.extract(frame)
-        with watch.stage("register"):
-            step = self._step(frame, observations)
-        with watch.stage("links"):
-            links = self._link(observations, step)
-        with watch.stage("window"):
-            causal, T_previous_frame = self._smooth(step, links)
-            self._select_keyframes(observations, step, links.scores, causal)
-        with watch.stage("loops"):
-            joins, loops = self._map.add(observations, causal, links.found, self._chain.anchor)
+        self._take_over_configuration()
+        observations = self._frontend.extract(frame)
+        watch.lap("extract")
+        step = self._step(frame, observations)
+        watch.lap("register")
+        links = self._link(observations, step)
+        watch.lap("links")
+        causal, T_previous_frame = self._smooth(step, links)
+        self._select_keyframes(observations, step, links.scores, causal)
+        watch.lap("window")
+        joins, loops = self._map.add(observations, causal, links.found, self._chain.anchor)
+        watch.lap("loops")
         poses = causal, T_previous_frame
         return self._result(observations, step, links.offered, *poses, joins, loops, watch.stage_ms)
 
@@ -507,17 +505,13 @@ def _check_frame(frame: Stamped, camera: StereoCamera | PinholeCamera) -> None:
 
 
 class Stopwatch:
-    """Measures stages of work by name."""
+    """Measures stages of work that follow each other, by name."""
 
     def __init__(self) -> None:
         self.stage_ms: dict[str, float] = {}
+        self._last_s = time.perf_counter()
 
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Add the time spent inside to a stage."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            elapsed = 1e3 * (time.perf_counter() - start)
-            self.stage_ms[name] = self.stage_ms.get(name, 0.0) + elapsed
+    def lap(self, name: str) -> None:
+        """End a stage."""
+        last_s, self._last_s = self._last_s, time.perf_counter()
+        self.stage_ms[name] = 1e3 * (self._last_s - last_s)
