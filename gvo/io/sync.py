@@ -23,6 +23,11 @@ _N_TO_CONFIRM = 3
 # Periods that are known before one is relied on, and the share of the shortest that counts.
 _N_PERIODS = 10
 _SHORTEST = 0.8
+# Images of each stream (of equal stamps: stamps of both together) that are kept while their
+# partners may still come, and how much nearer, as a share, a later partner must be to be preferred
+# to an earlier one: as message_filters has them by default.
+_QUEUE_SIZE = 100
+_AGE_PENALTY = 0.1
 
 
 def pair_images(
@@ -30,8 +35,6 @@ def pair_images(
     *,
     limit_ns: int,
     partner: str,
-    queue_size: int = 100,
-    age_penalty: float = 0.1,
     is_prompt: bool = False,
 ) -> Iterator[Paired]:
     """Pair the images of stream 0 with those of stream 1, as message_filters of ROS does.
@@ -49,11 +52,6 @@ def pair_images(
         Largest difference of the stamps of a pair, nanoseconds; 0: equal stamps.
     partner : str
         What stream 1 is called in messages, with the parameter that sets the limit.
-    queue_size : int
-        Images of each stream that are kept (ExactTime: stamps of both together) while their
-        partners may still come; then the oldest is given up.
-    age_penalty : float
-        How much nearer, as a share, a later partner must be to be preferred to an earlier one.
     is_prompt : bool
         Give an approximate pair out as soon as the period of the images says that no better
         partner can come, not with the next image. The pairs are the same, unless a camera
@@ -83,10 +81,10 @@ def pair_images(
     ----------
     .. [1] http://wiki.ros.org/message_filters/ApproximateTime
     """
-    answers = _Answers(limit_ns, partner, queue_size)
-    policy: _ExactTime | _ApproximateTime = _ExactTime(queue_size, answers)
+    answers = _Answers(limit_ns, partner)
+    policy: _ExactTime | _ApproximateTime = _ExactTime(answers)
     if limit_ns > 0:
-        policy = _ApproximateTime(limit_ns, queue_size, age_penalty, answers, is_prompt=is_prompt)
+        policy = _ApproximateTime(limit_ns, answers, is_prompt=is_prompt)
     try:
         for image in images:
             policy.push(image)
@@ -102,8 +100,8 @@ def pair_images(
 class _Answers:
     """Pairs and faulty frames, one for each image of stream 0, in the order of stamps."""
 
-    def __init__(self, limit_ns: int, partner: str, queue_size: int) -> None:
-        self._limit_ns, self._partner, self._queue_size = limit_ns, partner, queue_size
+    def __init__(self, limit_ns: int, partner: str) -> None:
+        self._limit_ns, self._partner = limit_ns, partner
         self._ready: list[Paired] = []
         self._passed_ns: int | None = None  # the last stamp of stream 1 that was dealt with
         self.last_ns: int | None = None  # of the last pair
@@ -142,7 +140,7 @@ class _Answers:
         gaps = [abs(stamp_ns - image.stamp_ns) for stamp_ns in around]
         nearest = f"the nearest is {min(gaps) / 1e6:g} ms away" if gaps else "there is none"
         if is_crowded:
-            nearest += f", and {self._queue_size} images wait already"
+            nearest += f", and {_QUEUE_SIZE} images wait already"
         elif gaps and min(gaps) <= self._limit_ns:
             nearest += " and belongs to another image"
         reason = f"no {self._partner}={self._limit_ns / 1e6:g}: {nearest}"
@@ -155,8 +153,8 @@ class _Answers:
 class _ExactTime:
     """Images wait by their stamp; a pair ends the wait of all older ones."""
 
-    def __init__(self, queue_size: int, answers: _Answers) -> None:
-        self._queue_size, self._answers = queue_size, answers
+    def __init__(self, answers: _Answers) -> None:
+        self._answers = answers
         self._stamps: list[int] = []  # a heap of the keys of `_waiting`
         self._waiting: dict[int, list[StampedImage | None]] = {}
 
@@ -171,7 +169,7 @@ class _ExactTime:
             self._waiting[image.stamp_ns] = [None, None]
             heapq.heappush(self._stamps, image.stamp_ns)
         self._store(image)
-        if len(self._waiting) > self._queue_size:
+        if len(self._waiting) > _QUEUE_SIZE:
             self._leave_oldest(is_crowded=True)
 
     def end(self) -> None:
@@ -212,13 +210,9 @@ class _ApproximateTime:
     other stream up to the first one after it.
     """
 
-    def __init__(
-        self, limit_ns: int, queue_size: int, penalty: float, answers: _Answers, *, is_prompt: bool
-    ) -> None:
+    def __init__(self, limit_ns: int, answers: _Answers, *, is_prompt: bool) -> None:
         self._periods = (_Period(), _Period()) if is_prompt else None
-        self._limit_ns, self._queue_size = limit_ns, queue_size
-        self._factor = 1 + penalty
-        self._answers = answers
+        self._limit_ns, self._answers = limit_ns, answers
         self._queues: tuple[deque[StampedImage], deque[StampedImage]] = (deque(), deque())
         # Where images were given up, one of them might have suited a pivot better than what is
         # left: no image of that stream is a pivot until the other stream has caught up.
@@ -233,7 +227,7 @@ class _ApproximateTime:
         if self._periods is not None:
             self._periods[image.stream].add(image.stamp_ns)
         self._advance()
-        if len(queue) > self._queue_size:
+        if len(queue) > _QUEUE_SIZE:
             self._pivot = None
             self._leave(image.stream, is_crowded=True)
             self._has_gap[image.stream] = True
@@ -303,7 +297,7 @@ class _ApproximateTime:
 
     def _is_nearer(self, pivot_ns: int, best_ns: int, later_ns: int) -> bool:
         """Tell whether a partner after the pivot is preferred to the best one before it."""
-        return _scaled_ns(later_ns - pivot_ns, self._factor) < pivot_ns - best_ns
+        return _scaled_ns(later_ns - pivot_ns, 1 + _AGE_PENALTY) < pivot_ns - best_ns
 
     def _give_candidate(self) -> None:
         self._pivot = None

@@ -17,35 +17,21 @@ _LIMIT = 20
 _QUEUE = 100
 _rising_stamps = st.lists(st.integers(0, 300), unique=True, max_size=30).map(sorted)
 _KNOWN = [
-    ([100, 130], [85, 112], 20, 0.1, [(0, 1)]),
-    ([100, 130], [85, 112, 131], 20, 0.1, [(0, 1), (1, 2)]),
-    ([100, 200], [92, 110, 190, 210], 20, 0.1, [(0, 0), (1, 2)]),
-    ([100, 200], [92, 106, 190, 205], 20, 0.1, [(0, 1), (1, 3)]),
-    (
-        [0, 33, 67, 100, 133, 167, 200],
-        [10, 77, 143, 210],
-        20,
-        0.1,
-        [(0, 0), (2, 1), (4, 2), (6, 3)],
-    ),
-    (
-        [0, 33, 66, 99, 132],
-        [16, 50, 82, 116, 148],
-        20,
-        0.1,
-        [(0, 0), (1, 1), (2, 2), (3, 3), (4, 4)],
-    ),
-    ([0, 33, 66, 99, 132], [16, 50, 82, 116, 148], 20, 0.0, [(0, 0), (2, 1), (3, 2), (4, 3)]),
-    ([100, 200, 150, 300], [100, 200, 150, 300], 20, 0.1, [(0, 0), (1, 1), (3, 3)]),
-    ([100, 100, 130], [95, 100, 100, 131], 20, 0.1, [(0, 1), (2, 3)]),
-    ([0, 10, 20, 31, 100], [31, 101], 40, 0.1, [(3, 0), (4, 1)]),
-    ([31, 101], [0, 10, 20, 30, 100], 40, 0.1, [(0, 3), (1, 4)]),
-    ([0, 20, 40, 60, 80], [19, 41, 59, 81], 20, 0.1, [(1, 0), (2, 1), (3, 2), (4, 3)]),
-    ([1, 3, 2, 4], [1, 2, 3, 4], 0, 0.1, [(0, 0), (2, 1), (1, 2), (3, 3)]),
+    ([100, 130], [85, 112], 20, [(0, 1)]),
+    ([100, 130], [85, 112, 131], 20, [(0, 1), (1, 2)]),
+    ([100, 200], [92, 110, 190, 210], 20, [(0, 0), (1, 2)]),
+    ([100, 200], [92, 106, 190, 205], 20, [(0, 1), (1, 3)]),
+    ([0, 33, 67, 100, 133, 167], [10, 77, 143], 20, [(0, 0), (2, 1), (4, 2)]),
+    ([0, 33, 66, 99], [16, 50, 82, 116], 20, [(0, 0), (1, 1), (2, 2), (3, 3)]),
+    ([100, 200, 150, 300], [100, 200, 150, 300], 20, [(0, 0), (1, 1), (3, 3)]),
+    ([100, 100, 130], [95, 100, 100, 131], 20, [(0, 1), (2, 3)]),
+    ([0, 10, 20, 31, 100], [31, 101], 40, [(3, 0), (4, 1)]),
+    ([31, 101], [0, 10, 20, 30, 100], 40, [(0, 3), (1, 4)]),
+    ([0, 20, 40, 60, 80], [19, 41, 59, 81], 20, [(1, 0), (2, 1), (3, 2), (4, 3)]),
+    ([1, 3, 2, 4], [1, 2, 3, 4], 0, [(0, 0), (2, 1), (1, 2), (3, 3)]),
     # nearer by the penalty exactly, in floating point
-    ([10**8], [89_000_000, 110_000_000], 20_000_000, 0.1, [(0, 0)]),
-    ([100], [88, 110], 20, 0.1, [(0, 1)]),
-    ([100], [88, 110], 20, 0.5, [(0, 0)]),
+    ([10**8], [89_000_000, 110_000_000], 20_000_000, [(0, 0)]),
+    ([100], [88, 110], 20, [(0, 1)]),
 ]
 _any_stamps = st.lists(st.integers(0, 400), max_size=30)
 _stamps = st.one_of(_any_stamps.map(sorted), _any_stamps)
@@ -74,12 +60,11 @@ def _pair(
     order: Iterable[bool] = (),
     *,
     limit_ns: int = _LIMIT,
-    age_penalty: float = 0.1,
 ) -> list[tuple[int, int] | str]:
     """Return stamps of pairs, or what is wrong with an image of stream 0."""
     found: list[tuple[int, int] | str] = []
     images = _interleave(first, second, order)
-    for item in pair_images(images, limit_ns=limit_ns, partner="depth", age_penalty=age_penalty):
+    for item in pair_images(images, limit_ns=limit_ns, partner="depth"):
         if isinstance(item, FaultyFrame):
             found.append(f"{item.stamp_ns}: {item.reason}")
         else:
@@ -94,30 +79,26 @@ def _answered(answers: list[tuple[int, int] | str]) -> list[int]:
     ]
 
 
-def _pairs(first: list[int], second: list[int], age_penalty: float = 0.1) -> list[tuple[int, int]]:
-    answers = _pair(first, second, age_penalty=age_penalty)
+def _pairs(first: list[int], second: list[int]) -> list[tuple[int, int]]:
+    answers = _pair(first, second)
     return [answer for answer in answers if isinstance(answer, tuple)]
 
 
-@given(first=_rising_stamps, second=_rising_stamps, age_penalty=st.floats(0, 10))
+@given(first=_rising_stamps, second=_rising_stamps)
 def test_pairs_keep_the_limit_and_the_order_and_use_each_image_once(
-    first: list[int], second: list[int], age_penalty: float
+    first: list[int], second: list[int]
 ) -> None:
-    pairs = _pairs(first, second, age_penalty)
+    pairs = _pairs(first, second)
     assert all(abs(image - partner) <= _LIMIT for image, partner in pairs)
     for stream in zip(*pairs, strict=True):
         assert list(stream) == sorted(set(stream))
 
 
-@pytest.mark.parametrize(("first", "second", "limit_ns", "age_penalty", "places"), _KNOWN)
+@pytest.mark.parametrize(("first", "second", "limit_ns", "places"), _KNOWN)
 def test_known_pairs_are_found(
-    first: list[int],
-    second: list[int],
-    limit_ns: int,
-    age_penalty: float,
-    places: list[tuple[int, int]],
+    first: list[int], second: list[int], limit_ns: int, places: list[tuple[int, int]]
 ) -> None:
-    answers = _pair(first, second, limit_ns=limit_ns, age_penalty=age_penalty)
+    answers = _pair(first, second, limit_ns=limit_ns)
     pairs = [answer for answer in answers if isinstance(answer, tuple)]
     assert pairs == [(first[n], second[k]) for n, k in places]
 

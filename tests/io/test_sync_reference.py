@@ -27,7 +27,7 @@ pytestmark = [
     ),
 ]
 
-# Reads a line per sequence: queue size, limit, age penalty, then stream and stamp of each image.
+# Reads a line per sequence: the limit, then stream and stamp of each image.
 # Writes a line: for each pair the number of images pushed so far, and the places of both images
 # within their streams.
 _PROGRAM = r"""
@@ -90,18 +90,15 @@ int main()
   while (std::getline(std::cin, line))
   {
     std::istringstream words(line);
-    uint32_t queue_size;
     int64_t limit_ns;
-    double age_penalty;
-    words >> queue_size >> limit_ns >> age_penalty;
+    words >> limit_ns;
     if (limit_ns == 0)
     {
-      run(policies::ExactTime<Image, Image>(queue_size), words);
+      run(policies::ExactTime<Image, Image>(100), words);
       continue;
     }
-    policies::ApproximateTime<Image, Image> policy(queue_size);
+    policies::ApproximateTime<Image, Image> policy(100);
     policy.setMaxIntervalDuration(ros::Duration().fromNSec(limit_ns));
-    policy.setAgePenalty(age_penalty);
     run(policy, words);
   }
 }
@@ -110,7 +107,7 @@ _LIBRARIES = ("message_filters", "roscpp", "rosconsole", "rostime", "boost_threa
 
 Message = tuple[int, int]  # stream and stamp, in the order of arrival
 Pairs = list[tuple[int, int, int]]  # images pushed so far, places of both images in their streams
-Reference = Callable[[list[Message], int, int, float], Pairs]
+Reference = Callable[[list[Message], int], Pairs]
 
 
 @pytest.fixture(scope="module")
@@ -133,11 +130,9 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Reference]:
         assert process.stdout is not None
         requests, answers = process.stdin, process.stdout
 
-        def ask(
-            messages: list[Message], queue_size: int, limit_ns: int, age_penalty: float
-        ) -> Pairs:
+        def ask(messages: list[Message], limit_ns: int) -> Pairs:
             words = " ".join(f"{stream} {stamp_ns}" for stream, stamp_ns in messages)
-            requests.write(f"{queue_size} {limit_ns} {age_penalty!r} {words}\n")
+            requests.write(f"{limit_ns} {words}\n")
             numbers = map(int, answers.readline().split())
             return list(zip(numbers, numbers, numbers, strict=True))
 
@@ -145,9 +140,7 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Reference]:
         process.stdin.close()
 
 
-def _pairs(
-    messages: list[Message], queue_size: int, limit_ns: int, age_penalty: float
-) -> tuple[Pairs, Pairs]:
+def _pairs(messages: list[Message], limit_ns: int) -> tuple[Pairs, Pairs]:
     """Return the pairs given while images came, and those given at the end."""
     images = [
         StampedImage(stream=k, stamp_ns=t, load=lambda: np.zeros((1, 1))) for k, t in messages
@@ -166,9 +159,7 @@ def _pairs(
         is_ended = True
 
     found: tuple[Pairs, Pairs] = ([], [])
-    for item in pair_images(
-        push(), limit_ns=limit_ns, partner="x", queue_size=queue_size, age_penalty=age_penalty
-    ):
+    for item in pair_images(push(), limit_ns=limit_ns, partner="x"):
         if not isinstance(item, FaultyFrame):
             places_of_pair = places[id(item[0])], places[id(item[1])]
             found[is_ended].append((n_pushed, *places_of_pair))
@@ -186,17 +177,16 @@ def _advancing(pairs: Pairs, messages: list[Message]) -> Pairs:
 
 
 def _check(
-    reference: Reference, messages: list[Message], *options: int | float, is_overflowing: bool
+    reference: Reference, messages: list[Message], limit_ns: int, *, is_overflowing: bool = False
 ) -> int:
     """Compare with message_filters; return the number of pairs."""
-    queue_size, limit_ns, age_penalty = int(options[0]), int(options[1]), float(options[2])
-    expected = _advancing(reference(messages, queue_size, limit_ns, age_penalty), messages)
-    while_coming, at_the_end = _pairs(messages, queue_size, limit_ns, age_penalty)
+    expected = _advancing(reference(messages, limit_ns), messages)
+    while_coming, at_the_end = _pairs(messages, limit_ns)
     assert while_coming == expected
     if not is_overflowing:
         end_ns = max((stamp_ns for _, stamp_ns in messages), default=0) + 10**12
         ended = [*messages, (0, end_ns), (1, end_ns)]
-        expected = _advancing(reference(ended, queue_size, limit_ns, age_penalty), ended)
+        expected = _advancing(reference(ended, limit_ns), ended)
         places = [pair[1:] for pair in expected[:-1]]  # the last one is that of the end
         assert [pair[1:] for pair in while_coming + at_the_end] == places
     return len(expected)
@@ -204,7 +194,6 @@ def _check(
 
 _units = st.sampled_from([1, 37, 1_000_000])
 _limits = st.sampled_from([0, 1, 5, 20, 60, 10_000])
-_penalties = st.sampled_from([0.0, 0.1, 0.5, 3.0])
 _any_order = st.lists(st.tuples(st.integers(0, 1), st.integers(0, 200)), max_size=40)
 _crowded = st.lists(st.tuples(st.integers(0, 1), st.integers(0, 12)), max_size=40)
 _messages = st.one_of(
@@ -213,21 +202,22 @@ _messages = st.one_of(
 
 
 @settings(max_examples=300)
-@given(messages=_messages, unit=_units, limit=_limits, age_penalty=_penalties)
+@given(messages=_messages, unit=_units, limit=_limits)
 def test_the_pairs_are_those_of_message_filters_and_come_after_the_same_image(
-    reference: Reference, messages: list[Message], unit: int, limit: int, age_penalty: float
+    reference: Reference, messages: list[Message], unit: int, limit: int
 ) -> None:
     scaled = [(stream, stamp * unit) for stream, stamp in messages]
-    _check(reference, scaled, 100, limit * unit, age_penalty, is_overflowing=False)
+    _check(reference, scaled, limit * unit)
 
 
 @pytest.mark.acceptance
 @settings(max_examples=300)
-@given(messages=_messages, limit=_limits, age_penalty=_penalties, queue_size=st.integers(1, 6))
+@given(messages=_messages, limit=_limits, stream=st.integers(0, 1), n=st.integers(85, 120))
 def test_queues_overflow_as_those_of_message_filters(
-    reference: Reference, messages: list[Message], limit: int, age_penalty: float, queue_size: int
+    reference: Reference, messages: list[Message], limit: int, stream: int, n: int
 ) -> None:
-    _check(reference, messages, queue_size, limit, age_penalty, is_overflowing=True)
+    alone = [(stream, k) for k in range(n)]
+    _check(reference, [*alone, *messages], limit, is_overflowing=True)
 
 
 def _camera_stamps(
@@ -261,5 +251,5 @@ def test_cameras_of_any_rates_are_paired_as_by_message_filters(
             arrivals += [(time, stream, int(t)) for time, t in zip(arrived, stamps, strict=True)]
         messages = [(stream, stamp_ns) for _, stream, stamp_ns in sorted(arrivals)]
         limit_ns = rng.choice([0, 2_000_000, 16_600_000, 20_000_000, 200_000_000])
-        n_pairs += _check(reference, messages, 100, int(limit_ns), 0.1, is_overflowing=False)
+        n_pairs += _check(reference, messages, int(limit_ns))
     assert n_pairs > 5000
