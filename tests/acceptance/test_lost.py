@@ -47,8 +47,8 @@ def test_a_second_in_the_dark_costs_the_global_poses_nothing(gvo_data: Path) -> 
 
 def test_a_camera_that_was_lost_in_a_room_finds_its_place() -> None:
     check(
-        gvo.SyntheticRecording("handheld", "rgbd", n_frames=240, seed=4, scale=0.5),
-        Black(first=80, end=150),
+        gvo.SyntheticRecording("handheld", "rgbd", n_frames=180, seed=4, scale=0.4),
+        Black(first=60, end=120),
     )
 
 
