@@ -24,7 +24,7 @@ from tests.make.recordings import Held, hold
 
 N_FRAMES = 8
 # Long enough to be stopped in the middle, also where the machine is busy.
-N_LONG = 250
+N_LONG = 150
 NO_REPORT = BatchOptions(report=False)
 _PATIENCE_S = 60.0
 

@@ -18,7 +18,6 @@ from tests.conftest import (
     GVO,
     Answer,
     Command,
-    assert_same_files,
     is_one_line,
     python,
     refused,
@@ -145,38 +144,12 @@ def test_no_scheduler_is_a_line(
     assert f"{address}: no scheduler of Dask answers" in said
 
 
-def test_workers_that_cannot_be_started_are_a_line(
-    bags: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def failing(**_: object) -> None:
-        raise RuntimeError("Nanny failed to start.") from BrokenPipeError(32, "Broken pipe")
-
-    monkeypatch.setattr("gvo.batch.engine.LocalCluster", failing)
-    answer = command("batch", bags, "--out", tmp_path / "out")
-    assert answer.code == 2
-    assert "gvo: error: workers cannot be started: [Errno 32] Broken pipe" in answer.err
-    assert "Traceback" not in answer.err
-
-
 def test_without_a_package_it_says_how_to_get_it(bags: Path, tmp_path: Path) -> None:
     program = f"import sys; sys.modules['dask'] = None\n{GVO[-1]}"
     said = refused(python("-c", program, "batch", bags, "--out", tmp_path / "out"))
     assert "batches need dask; install it by: " in said
     assert "[batch]'" in said
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.acceptance
-def test_on_this_machine_it_needs_no_cluster_and_is_the_same(
-    bags: Path, tmp_path: Path, run_alone: Callable[[Path], Path]
-) -> None:
-    options = ["--out", tmp_path, "--workers", "2", "--no-report"]
-    answer = python(*GVO[1:], "batch", bags / "*.mcap", *options)
-    assert answer.returncode == 0, answer.stderr
-    # Nothing of what the processes have to say to one another.
-    assert all(line.startswith("[") for line in answer.stderr.splitlines()), answer.stderr
-    bag = bags / "walk0.mcap"
-    assert_same_files(tmp_path / bag.stem, run_alone(bag))
 
 
 @pytest.mark.acceptance

@@ -13,7 +13,7 @@ import dask
 import pytest
 from distributed import Client
 
-from gvo.batch.engine import BatchProgress, ClusterError, Engine, connected
+from gvo.batch.engine import BatchProgress, Engine, connected
 from gvo.batch.inputs import NamedRecording, make_variants
 from gvo.batch.running import make_tasks
 from gvo.batch.tasks import MARK, Task, TaskOptions
@@ -47,23 +47,6 @@ def known_to_scheduler(client: Client) -> int:
         return sum(str(key).startswith("('gvo-batch") for key in dask_scheduler.tasks)
 
     return int(client.run_on_scheduler(count))
-
-
-def test_a_client_that_cannot_start_is_not_left_to_the_collector(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """It would wait there, for ever, for a lock that the start of another client may hold."""
-    clients: list[Client] = []
-    start: Any = Client.start
-
-    def watched(client: Client, **options: Any) -> None:
-        clients.append(client)
-        start(client, **options)
-
-    monkeypatch.setattr(Client, "start", watched)
-    with pytest.raises(ClusterError), connected("nonsense://x", None):
-        pass
-    assert [client.status for client in clients] == ["closed"]
 
 
 @contextmanager

@@ -99,11 +99,6 @@ def test_nothing_found_is_an_error(tmp_path: Path, kind: str) -> None:
         find_recordings([tmp_path / asked])
 
 
-def test_a_name_is_the_stem_where_that_is_enough() -> None:
-    asked = ["/x/a.bag", "/y/b.mcap.zstd", "/z/c", "/u/d.db3", "/v/2011.09.26"]
-    assert names(find_recordings(asked)) == ["a", "b", "c", "d", "2011.09.26"]
-
-
 def test_what_has_one_stem_is_told_apart_by_its_ending_or_its_folders() -> None:
     asked = ["/p/a.bag", "/p/a.mcap", "/p/1/drive.bag", "/p/2/drive.bag", "/p/b.bag"]
     expected = ["a.bag", "a.mcap", "1-drive.bag", "2-drive.bag", "b"]

@@ -95,14 +95,6 @@ def test_any_table_has_a_report(tmp_path: Path, rows: list[BatchRow], shows: str
     assert shows in page_of(tmp_path, rows).text
 
 
-def test_a_run_with_few_poses_is_not_compared(tmp_path: Path) -> None:
-    rows = made_up([1, 3], 3)
-    rows[1] = replace(rows[1], coverage_percent=50.0, ate_smoothed_m=1e-9)
-    page = page_of(tmp_path, rows)
-    medians = page.text.partition('id="configurations"')[2].partition('id="runs"')[0]
-    assert medians.index("window.n_links=1") < medians.index("window.n_links=3")
-
-
 def test_nothing_outside_is_referred_to_and_equal_tables_give_equal_files(tmp_path: Path) -> None:
     rows = made_up([1, 3], 3)
     page = page_of(tmp_path, rows)

@@ -6,7 +6,6 @@ import pandas as pd
 import pytest
 
 from gvo.batch.results import CSV, to_frame, write_results
-from gvo.batch.tasks import Value
 from gvo.errors import OutputError
 from tests.batch.rows import complete, failed
 
@@ -59,27 +58,6 @@ def test_what_is_no_character_in_the_name_of_a_file_is_escaped(tmp_path: Path) -
     frame = to_frame([failed(source=source, reason=f"{source}: no", parameters={"a.b": source})])
     write_results(frame, tmp_path)
     assert pd.read_csv(tmp_path / CSV)["source"][0] == r"/x/\udcff.bag"
-
-
-@pytest.mark.parametrize(
-    ("values", "kind"),
-    [
-        ([1, 2, None], "Int64"),
-        ([True, False, None], "boolean"),
-        ([1, "klt", None], "object"),
-    ],
-)
-def test_the_values_of_a_parameter_are_given_back(
-    tmp_path: Path, values: list[Value], kind: str
-) -> None:
-    frame = to_frame([complete(parameters={"x.y": value}) for value in values])
-    assert str(frame["x.y"].dtype) == kind
-    assert [None if pd.isna(value) else value for value in frame["x.y"]] == values
-    write_results(frame, tmp_path)
-    read = pd.read_csv(tmp_path / CSV, dtype=str)["x.y"]
-    assert [None if pd.isna(text) else text for text in read] == [
-        None if value is None else str(value) for value in values
-    ]
 
 
 def test_what_cannot_be_written_leaves_what_was_there(tmp_path: Path) -> None:

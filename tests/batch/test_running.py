@@ -77,26 +77,6 @@ def test_a_stopped_batch_leaves_a_table(near: Client, bags: Path, tmp_path: Path
     assert "were not made" not in page
 
 
-def test_the_table_grows_while_the_batch_goes(
-    near: Client, bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("gvo.batch.running._EVERY_S", 0.0)
-    lengths: list[int] = []
-
-    def look(progress: BatchProgress) -> None:
-        if progress.row is not None:
-            lengths.append(len(pd.read_csv(tmp_path / "results.csv")))
-
-    run(
-        [*bags.iterdir(), "/none.bag"],
-        out=tmp_path,
-        client=near,
-        options=NO_REPORT,
-        on_progress=look,
-    )
-    assert lengths == [1, 2, 3, 4]
-
-
 def test_a_table_that_cannot_be_written_ends_the_batch(
     near: Client, bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
