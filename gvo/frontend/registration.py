@@ -131,7 +131,7 @@ def estimate_roughly(
         return found
     T = found.T_reference_current
     residuals = StereoResiduals.of(T, correspondences, camera)
-    refined = descend(T, residuals.select(found.inliers), n_iterations=_N_ROUGH_ITERATIONS)
+    refined = descend(T, residuals, found.inliers, n_iterations=_N_ROUGH_ITERATIONS)
     return T if refined is None else refined
 
 

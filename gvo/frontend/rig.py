@@ -29,7 +29,8 @@ from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.ransac import find_inliers
 from gvo.geometry.refinement import Adjustment, adjust, estimate_constants
-from gvo.geometry.residuals import StereoResiduals, pose_jacobian
+from gvo.geometry.residuals import StereoResiduals
+from gvo.kernels import shutter
 from gvo.types import (
     ConstantError,
     Failure,
@@ -83,8 +84,6 @@ _MAX_SURPRISE = 3.0
 _N_MISFITS = 30
 _MAX_MISFIT = 2.0
 _SHARED = 0.25
-# Moved to the middle of the exposure, points must stay in front of the camera.
-_MIN_DEPTH_M = 0.05
 
 
 class ConstantFilter:
@@ -231,7 +230,7 @@ class FrameMotion:
         told = self.told
         if told is None or self.velocity is None:
             return np.zeros(6)
-        return told.found.effects @ ((self.velocity - told.velocity) / told.sigmas)
+        return ((self.velocity - told.velocity) / told.sigmas) @ told.found.effects
 
 
 class Moving(Protocol):
@@ -447,57 +446,21 @@ def settle_rows(
     -------
     ndarray of float64, shape (n, 3)
     """
-    if velocity is None or readout_s == 0.0 or len(uvd) == 0:
+    if velocity is None or readout_s == 0.0:
         return uvd
-    u, v, disparities = uvd.T
-    dt = readout_s * _row_times(v, camera)
-    rates = _ray_rates(uvd, velocity, camera)
-    # The motion is small: its exponential to second order. All is divided by the depth.
-    x, y, z = dt * (rates + 0.5 * dt * (se3.skew(velocity[:3]) @ rates))
-    z += 1.0
-    in_front = z > (_MIN_DEPTH_M / (camera.fx * camera.baseline)) * disparities
-    z[~in_front] = 1.0  # not taken
     settled = np.empty_like(uvd)
-    settled[:, 0] = (u - camera.cx + camera.fx * x) / z + camera.cx
-    settled[:, 1] = (v - camera.cy + camera.fy * y) / z + camera.cy
-    settled[:, 2] = disparities / z
-    return np.where(in_front[:, np.newaxis], settled, uvd)
+    shutter.settle_rows(uvd, velocity, readout_s, camera.parameters, settled)
+    return settled
 
 
 def settling_rates(
     uvd: FloatArray, velocity: FloatArray | None, camera: StereoCamera
 ) -> FloatArray:
     """Return the derivatives of what `settle_rows` gives by the readout time, shape (n, 3)."""
-    if velocity is None:
-        return np.zeros_like(uvd)
-    u, v, disparities = uvd.T
-    x, y, z = _row_times(v, camera) * _ray_rates(uvd, velocity, camera)
-    rates = np.empty_like(uvd)
-    rates[:, 0] = camera.fx * x - (u - camera.cx) * z
-    rates[:, 1] = camera.fy * y - (v - camera.cy) * z
-    rates[:, 2] = -disparities * z
+    rates = np.zeros_like(uvd)
+    if velocity is not None:
+        shutter.write_readout_rates(uvd, velocity, camera.parameters, rates)
     return rates
-
-
-def _ray_rates(uvd: FloatArray, velocity: FloatArray, camera: StereoCamera) -> FloatArray:
-    """Return how fast points move in the camera's frame over their depth, shape (3, n), 1/s."""
-    wx, wy, wz, *shift = velocity.tolist()
-    x, y = camera.cx / camera.fx, camera.cy / camera.fy
-    # omega x ray + shift / depth, by (u, v, disparity) and one.
-    a, b, c = (each / (camera.fx * camera.baseline) for each in shift)
-    rates = np.array(
-        [
-            [0.0, -wz / camera.fy, a, wy + wz * y],
-            [wz / camera.fx, 0.0, b, -wx - wz * x],
-            [-wy / camera.fx, wx / camera.fy, c, wy * x - wx * y],
-        ]
-    )
-    return np.asarray(rates[:, :3] @ uvd.T + rates[:, 3:])
-
-
-def _row_times(v: FloatArray, camera: StereoCamera) -> FloatArray:
-    """Return when rows are exposed, as a share of the readout time after its middle."""
-    return np.asarray(v / camera.height - 0.5)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -650,7 +613,7 @@ class CalibratedCamera:
         told = measured.frames[1].motion.measured
         if told is not None:
             known = told.found.covariance
-            by_axis = by_axis if T_start is None else told.found.effects.T
+            by_axis = by_axis if T_start is None else told.found.effects
         by_velocity = by_axis.T @ known @ by_axis
         by_velocity = 0.5 * (by_velocity + by_velocity.T)  # symmetric in spite of rounding
         return replace(
@@ -689,9 +652,8 @@ class CalibratedCamera:
         inliers = find_inliers(T[np.newaxis], prepared, self._camera, config.ransac)[0]
         if np.count_nonzero(inliers) < config.ransac.min_inliers:
             return None
-        residuals = StereoResiduals.of(T, prepared, self._camera).select(inliers)
-        factor = measured.sigma_factor
-        found = adjust(T, residuals, n_iterations=_N_ITERATIONS, sigma_factor=factor)
+        residuals, factor = StereoResiduals.of(T, prepared, self._camera), measured.sigma_factor
+        found = adjust(T, residuals, inliers, n_iterations=_N_ITERATIONS, sigma_factor=factor)
         if found is None:
             return None
         return MeasuredVelocity(extrapolated=velocity, sigmas=sigmas, found=found)
@@ -700,11 +662,12 @@ class CalibratedCamera:
         self, corrected: Correspondences, sigmas: FloatArray, readout_s: float
     ) -> dict[str, FloatArray]:
         """Return the derivatives of corrected measurements by errors of the current velocity."""
-        rates = pose_jacobian(corrected.current_points.T, self._camera)
-        rates *= readout_s * _row_times(corrected.current_uvd[:, 1], self._camera)
-        rates *= sigmas[:, np.newaxis, np.newaxis]
-        both = np.swapaxes(np.stack([np.zeros_like(rates), rates], axis=1), 2, 3)
-        return dict(zip(_VELOCITIES, both, strict=True))
+        both = np.zeros((2, 6, len(corrected), 3))
+        shutter.write_velocity_errors(
+            *(corrected.current_points, corrected.current_uvd, sigmas, readout_s),
+            *(self._camera.parameters, both[1]),
+        )
+        return dict(zip(_VELOCITIES, np.swapaxes(both, 0, 1), strict=True))
 
     def _corrected(self, measured: Measurements) -> Correspondences:
         reference, current = (
@@ -749,8 +712,7 @@ class CalibratedCamera:
         for measured, result in links or (told_by if self._offsets.possible_readout_s else ()):
             T = result.T_reference_current
             prepared = self.prepare(measured, None)
-            residuals = StereoResiduals.of(T, prepared, self._camera).select(result.inliers)
-            at = residuals.linearize(T)
-            told = {} if isinstance(at, Failure) else estimate_constants(T, residuals, at)
+            residuals = StereoResiduals.of(T, prepared, self._camera)
+            told = estimate_constants(T, residuals, result.inliers)
             if READOUT in told:
                 self._offsets.note_readout(told[READOUT].times(self._offsets.readout.sigma), result)

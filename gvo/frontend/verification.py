@@ -176,7 +176,7 @@ def _descend(
     """Return the motion of the matches that fit a start better than what was found."""
     if np.count_nonzero(seeds) < n_needed:
         return None
-    return descend(T_start, found.residuals.select(seeds), n_iterations=_N_STEPS)
+    return descend(T_start, found.residuals, seeds, n_iterations=_N_STEPS)
 
 
 def _sample_motion(

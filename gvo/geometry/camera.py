@@ -120,6 +120,12 @@ class StereoCamera(PinholeCamera):
                 "(are left and right exchanged?)"
             )
 
+    @property
+    def parameters(self) -> FloatArray:
+        """The camera as kernels take it: fx, fy, cx, cy, baseline, width, height."""
+        values = self.fx, self.fy, self.cx, self.cy, self.baseline, self.width, self.height
+        return np.array(values, dtype=np.float64)
+
     @classmethod
     def from_pinhole(cls, pinhole: PinholeCamera, baseline: float) -> StereoCamera:
         """Return the stereo camera of this left camera and a baseline in metres."""

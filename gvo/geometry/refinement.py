@@ -20,50 +20,24 @@ heteroskedasticity", Econometrica 48(4), 1980, doi:10.2307/1912934 (the covarian
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
-from scipy.linalg.lapack import dposv
 
-from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
-from gvo.geometry.residuals import (
-    HUBER,
-    Linearization,
-    StereoResiduals,
-    whiten_in_place,
-)
+from gvo.geometry.residuals import HUBER, StereoResiduals
+from gvo.kernels import refinement as kernels
 from gvo.types import BoolArray, ConstantError, Failure, FloatArray
 
 GATE = 3.0
 """Maximum whitened residual of an inlier of a refined pose, sigmas."""
 
-# Iterations at most after the inliers are chosen again.
-_N_ITERATIONS = 10
-# Squared length of a step, in sigmas, that no longer matters.
-_CONVERGED = 1e-3
-# Variance inflation of a parameter above which a direction of motion is unobservable.
-_MAX_INFLATION = 1e10
-# Lower bound of the noise scale: two copies of one image, which recordings do hold, fit exactly
-# and tell no more about the motion than other pairs.
-_MIN_SCALE = 0.1
-# Pseudo-observations with the covariance implied by the sigmas: the sample covariance of few
-# gradients is itself uncertain. Without them 12 matches give an NEES of 3 instead of 1.
-_N_PROMISED = 24
-# Largest ratio of variances with and without the curvature of the kernel: if long residuals alone
-# constrain a direction, their curvature is no measure of it.
-_MAX_LOSS = 10.0
-# The first round only has to be good enough to choose the inliers again.
-_N_FIRST_ITERATIONS = 2
-# Information on a constant, relative to that of the current measurements alone, below which it is
-# rounding.
-_MIN_SHARE = 1e-10
-_IDENTITY = np.eye(6)
-_OPEN = "the matches leave a direction of motion open"
+_REASONS = {
+    kernels.BEHIND: "the motion puts points behind the camera",
+    kernels.OPEN: "the matches leave a direction of motion open",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -128,27 +102,19 @@ def refine_pose(
         A failure if a direction of motion is unobservable.
     """
     residuals = StereoResiduals.of(T_reference_current, matches, camera, huber=huber)
-    # Unobservable directions may give steps that are not finite; they are checked.
-    with np.errstate(over="ignore", invalid="ignore"):
-        rough = _gauss_newton(
-            T_reference_current, residuals.select(inliers), n_iterations=_N_FIRST_ITERATIONS
-        )
-        if isinstance(rough, Failure):
-            return rough
-        chosen = residuals.within(rough, gate)
-        if np.count_nonzero(chosen) < np.count_nonzero(inliers) // 2:
-            chosen = inliers
-        every, residuals = residuals, residuals.select(chosen)
-        T = _gauss_newton(rough, residuals, n_iterations=_N_ITERATIONS)
-        if isinstance(T, Failure):
-            return T
-        # Orthonormal to the last digit: many motions are composed with this one.
-        T = se3.normalize(T)
-        return _with_covariance(T, residuals, (chosen, every))
+    T, is_used = np.array(T_reference_current), np.array(inliers)
+    ended = kernels.refine(T, *residuals.arrays, is_used, camera.parameters, huber, gate)
+    if ended != kernels.DONE:
+        return Failure(reason=_REASONS[ended])
+    return _with_covariance(T, residuals, is_used)
 
 
 def descend(
-    T_reference_current: FloatArray, residuals: StereoResiduals, *, n_iterations: int
+    T_reference_current: FloatArray,
+    residuals: StereoResiduals,
+    is_used: BoolArray,
+    *,
+    n_iterations: int,
 ) -> FloatArray | None:
     """Minimize the cost of residuals by a few Gauss-Newton steps; None if they fail.
 
@@ -157,12 +123,15 @@ def descend(
     T_reference_current : ndarray of float64, shape (4, 4)
         Start value.
     residuals : StereoResiduals
+        Of n matches.
+    is_used : ndarray of bool, shape (n,)
+        Those that count.
     n_iterations : int
         Maximum number.
     """
-    with np.errstate(over="ignore", invalid="ignore"):
-        T = _gauss_newton(T_reference_current, residuals, n_iterations=n_iterations)
-    return None if isinstance(T, Failure) else T
+    T, camera = np.array(T_reference_current), residuals.camera.parameters
+    ended = kernels.descend(T, *residuals.arrays, is_used, camera, residuals.huber, n_iterations)
+    return T if ended == kernels.DONE else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -176,7 +145,7 @@ class Adjustment:
         Errors of the constants, in units of what is known of them.
     covariance : ndarray of float64, shape (k, k)
         Of these.
-    effects : ndarray of float64, shape (6, k)
+    effects : ndarray of float64, shape (k, 6)
         Derivative of the pose, right perturbation, by what is taken off for each error.
     """
 
@@ -189,6 +158,7 @@ class Adjustment:
 def adjust(
     T_reference_current: FloatArray,
     residuals: StereoResiduals,
+    is_used: BoolArray,
     *,
     n_iterations: int,
     sigma_factor: float = 1.0,
@@ -202,38 +172,23 @@ def adjust(
     T_reference_current : ndarray of float64, shape (4, 4)
         Start value.
     residuals : StereoResiduals
-        Of the matches used.
+        Of n matches.
+    is_used : ndarray of bool, shape (n,)
+        Those that count.
     n_iterations : int
         Of Gauss-Newton steps.
     sigma_factor : float
         Inflation of the matches' sigmas, relative to what is known of the constants.
     """
-    T = T_reference_current
-    J_constants, _ = residuals.sensitivities(T)
-    k, weight = len(J_constants), sigma_factor**2
-    values, H = np.zeros(k), np.eye(6 + k)
-    with np.errstate(over="ignore", invalid="ignore"):
-        for _ in range(n_iterations):
-            at = residuals.without(np.einsum("kin,k->in", J_constants, values)).linearize(T)
-            if isinstance(at, Failure):
-                return None
-            rows = np.concatenate([at.J, J_constants])
-            whiten_in_place(at.factors, rows[6:])
-            flat = rows.reshape(6 + k, -1)
-            H, g = flat @ flat.T, flat @ at.r.ravel()
-            H[6:, 6:] += weight * np.eye(k)
-            g[6:] -= weight * values
-            _, step, info = dposv(H, g)
-            if info != 0 or not np.isfinite(step).all():
-                return None
-            T = T @ se3.make_transform(cv2.Rodrigues(step[:3])[0], step[3:6])
-            values = values + step[6:]
-    return Adjustment(
-        T_reference_current=se3.normalize(T),
-        values=values,
-        covariance=weight * np.asarray(np.linalg.inv(H)[6:, 6:], dtype=np.float64),
-        effects=-np.asarray(np.linalg.solve(H[:6, :6], H[:6, 6:]), dtype=np.float64),
+    k, T = len(residuals.constants), np.array(T_reference_current)
+    values, covariance, effects = np.zeros(k), np.empty((k, k)), np.empty((k, 6))
+    ended = kernels.adjust(
+        *(T, *residuals.arrays, is_used, residuals.sensitivities, residuals.camera.parameters),
+        *(residuals.huber, sigma_factor**2, n_iterations, values, covariance, effects),
     )
+    if ended != kernels.DONE:
+        return None
+    return Adjustment(T_reference_current=T, values=values, covariance=covariance, effects=effects)
 
 
 def fit_covariance(
@@ -249,100 +204,45 @@ def fit_covariance(
     Parameters and results are those of `refine_pose`; pose and inliers stay as they are.
     """
     residuals = StereoResiduals.of(T_reference_current, matches, camera, huber=huber)
-    return _with_covariance(T_reference_current, residuals.select(inliers), (inliers, residuals))
-
-
-def _gauss_newton(
-    T: FloatArray, residuals: StereoResiduals, *, n_iterations: int
-) -> FloatArray | Failure:
-    """Return the pose after the last step."""
-    for _ in range(n_iterations):
-        at = residuals.linearize(T)
-        if isinstance(at, Failure):
-            return at
-        # LAPACK called directly: numpy takes several times as long for so small a matrix.
-        _, step, info = dposv(at.H, at.g)
-        if info != 0 or not np.isfinite(step).all():
-            return Failure(reason=_OPEN)
-        # Not the exponential map but a retraction: the same to first order, and cheap.
-        T = T @ se3.make_transform(cv2.Rodrigues(step[:3])[0], step[3:])
-        if step @ at.g < _CONVERGED:
-            break
-    return T
+    return _with_covariance(T_reference_current, residuals, inliers)
 
 
 def _with_covariance(
-    T: FloatArray, residuals: StereoResiduals, inliers: tuple[BoolArray, StereoResiduals]
+    T: FloatArray, residuals: StereoResiduals, inliers: BoolArray
 ) -> Refinement | Failure:
-    """Finish a refinement; `inliers` are the mask of the matches used and the residuals of all."""
-    last = residuals.linearize(T)
-    if isinstance(last, Failure):
-        return last
-    _, H_inverse, info = dposv(last.H, _IDENTITY)
-    inflation = np.diagonal(last.H) * np.diagonal(H_inverse)
-    if info != 0 or not np.all(inflation < _MAX_INFLATION):
-        return Failure(reason=_OPEN)
-    scale = _scale(last)
-    scores = last.scores()
-    sensitivity = _sensitivity(last, scores, H_inverse, residuals.huber)
-    covariance = sensitivity @ _spread(last, scores, scale) @ sensitivity.T
+    """Finish a refinement."""
+    covariance, scale = np.empty((6, 6)), np.empty(1)
+    ended = kernels.write_covariance(
+        *(np.array(T), *residuals.arrays, inliers, residuals.camera.parameters),
+        *(residuals.huber, covariance, scale),
+    )
+    if ended != kernels.DONE:
+        return Failure(reason=_REASONS[ended])
     return Refinement(
         T_reference_current=T,
-        covariance=0.5 * (covariance + covariance.T),
-        inliers=inliers[0],
-        scale=scale,
-        residuals=inliers[1],
-        calibration_errors=estimate_constants(T, residuals, last),
+        covariance=covariance,
+        inliers=inliers,
+        scale=float(scale[0]),
+        residuals=residuals,
+        calibration_errors=estimate_constants(T, residuals, inliers),
     )
 
 
-def _sensitivity(
-    at: Linearization, scores: FloatArray, H_inverse: FloatArray, huber: float
-) -> FloatArray:
-    """Return the inverse Hessian of the robust cost, shape (6, 6).
-
-    Beyond its threshold the Huber cost is linear: residuals there have no curvature along their
-    own direction. H, which weighs them as if they had, would make the pose overconfident.
-    """
-    squares = at.r[0] ** 2 + at.r[1] ** 2 + at.r[2] ** 2
-    far = np.flatnonzero(squares > huber**2)
-    pulls = scores[:, far] / np.sqrt(squares[far])
-    _, inverse, info = dposv(at.H - pulls @ pulls.T, _IDENTITY)
-    is_sane = info == 0 and np.all(np.diagonal(inverse) < _MAX_LOSS * np.diagonal(H_inverse))
-    return np.asarray(inverse) if is_sane else H_inverse
-
-
-def _scale(at: Linearization) -> float:
-    mean_square = float(np.vdot(at.r, at.r)) / max(at.r.size - 6, 1)
-    return max(math.sqrt(mean_square), _MIN_SCALE)
-
-
-def _spread(at: Linearization, scores: FloatArray, scale: float) -> FloatArray:
-    """Return the sample covariance of the gradient, shape (6, 6)."""
-    n = at.r.shape[1]
-    seen = n / max(n - 2, 1) * (scores @ scores.T)
-    promised = scale**2 * at.H
-    spread = (n * seen + _N_PROMISED * promised) / (n + _N_PROMISED)
-    return np.asarray(spread + _MIN_SCALE**2 * at.H)
-
-
 def estimate_constants(
-    T_reference_current: FloatArray, residuals: StereoResiduals, at: Linearization
+    T_reference_current: FloatArray, residuals: StereoResiduals, is_used: BoolArray
 ) -> dict[str, ConstantError]:
     """Estimate the errors of constants of the camera, each beside the pose and the others.
 
     Errors are in units of what is known of them: the others are around zero by a sigma of one.
-
-    Sigma is that of the sample, not implied by the matches' sigmas.
 
     Parameters
     ----------
     T_reference_current : ndarray of float64, shape (4, 4)
         The refined pose.
     residuals : StereoResiduals
-        Of the matches used.
-    at : Linearization
-        Of the residuals, at the refined pose.
+        Of n matches.
+    is_used : ndarray of bool, shape (n,)
+        Those that count.
 
     Returns
     -------
@@ -352,27 +252,15 @@ def estimate_constants(
     """
     if not residuals.constants:
         return {}
-    J_constants, J_alone = residuals.sensitivities(T_reference_current)
-    for rows in (J_constants, J_alone):
-        whiten_in_place(at.factors, rows)
-    flat, flat_pose = J_constants.reshape(len(J_constants), -1), at.J.reshape(6, -1)
-    _, motion, info = dposv(at.H, flat_pose @ flat.T)
-    if info != 0:
-        return {}
-    # Schur complement: what no motion explains.
-    unexplained = flat - motion.T @ flat_pose
-    information = unexplained @ unexplained.T
-    alone = np.sum(J_alone**2, axis=(1, 2))
-    told = np.flatnonzero(np.diagonal(information) > _MIN_SHARE * alone)
-    scores = np.einsum("kin,in->kn", unexplained.reshape(J_constants.shape), at.r)
-    # One at a time is free, the others are known.
-    free = np.eye(len(scores))[told]
-    known = np.eye(len(scores)) - free[:, np.newaxis] * free[:, :, np.newaxis]
-    gains = np.linalg.solve(information + known, free[:, :, np.newaxis])[:, :, 0]
-    variances = np.einsum("mi,mij,mj->m", gains, scores @ scores.T + known, gains)
+    told = np.empty((len(residuals.constants), 8))
+    ended = kernels.estimate_constants(
+        *(np.array(T_reference_current), *residuals.arrays, is_used, residuals.sensitivities),
+        *(residuals.camera.parameters, residuals.huber, told),
+    )
     return {
-        residuals.constants[k]: ConstantError(
-            value=float(value), sigma=float(np.sqrt(variance)), effect=motion[:, k]
+        name: ConstantError(value=float(value), sigma=float(sigma), effect=effect)
+        for name, (value, sigma, *_), effect in zip(
+            residuals.constants, told, told[:, 2:], strict=True
         )
-        for k, value, variance in zip(told, gains @ np.sum(scores, axis=1), variances, strict=True)
+        if ended == kernels.DONE and np.isfinite(value)
     }

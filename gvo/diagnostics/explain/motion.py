@@ -19,7 +19,7 @@ from gvo.frontend.tracking import WINDOW_RADIUS_PX
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
-from gvo.geometry.residuals import StereoResiduals, whiten_in_place
+from gvo.geometry.residuals import StereoResiduals
 from gvo.types import Contradiction, Failure, FloatArray, MotionPrior, RelativePose
 
 OwnFrontend: TypeAlias = KltFrontend | DescriptorFrontend
@@ -180,13 +180,12 @@ def _find_motion(
     ends = consensus.T_reference_current, result.T_reference_current
     residuals_px = np.stack([_residuals(T, matches, camera) for T in ends])
     known = StereoResiduals.of(ends[0], matches, camera)
-    whitened = residuals_px.transpose(0, 2, 1).copy()
-    for rows in whitened:
-        whiten_in_place(known.columns[6:12], rows)
+    lower = np.zeros((len(matches), 3, 3))
+    lower[:, *np.tril_indices(3)] = known.factors
     return motion | {
         "inliers": result.inliers,
         "residuals_px": residuals_px,
-        "whitened": whitened.transpose(0, 2, 1),
+        "whitened": np.einsum("nij,knj->kni", lower, residuals_px),
     }
 
 

@@ -1,0 +1,1 @@
+"""Loops over points, corners and pixels, compiled: arrays in, arrays out."""

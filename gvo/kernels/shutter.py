@@ -1,0 +1,81 @@
+"""A rolling shutter: what rows show, as seen in the middle of the exposure.
+
+Row v of h is exposed at the stamp + readout * (v / h - 1/2). Until the stamp a point moves in the
+camera's frame by exp(velocity * readout * (v / h - 1/2)) (Hedborg et al. 2012,
+doi:10.1109/CVPR.2012.6247831). A velocity is (rx, ry, rz, tx, ty, tz), rad/s and m/s, right of the
+pose; a camera is an array (fx, fy, cx, cy, baseline, width, height).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gvo.kernels.jit import In, Out, helper, kernel
+from gvo.kernels.residuals import write_pose_jacobian
+
+# Moved to the middle of the exposure, points must stay in front of the camera.
+_MIN_DEPTH_M = 0.05
+
+
+@helper
+def _ray_rate(uvd, velocity, camera):
+    """Return how fast a point moves in the camera's frame over its depth, 1/s."""
+    x, y = (uvd[0] - camera[2]) / camera[0], (uvd[1] - camera[3]) / camera[1]
+    inverse_depth = uvd[2] / (camera[0] * camera[4])
+    return (
+        velocity[1] - velocity[2] * y + inverse_depth * velocity[3],
+        velocity[2] * x - velocity[0] + inverse_depth * velocity[4],
+        velocity[0] * y - velocity[1] * x + inverse_depth * velocity[5],
+    )
+
+
+@helper
+def row_time(v, camera):
+    """Return when a row is exposed, as a share of the readout time after its middle."""
+    return v / camera[6] - 0.5
+
+
+@kernel(In("f8", 2), In("f8", 1), "f8", In("f8", 1), Out("f8", 2))
+def settle_rows(uvd, velocity, readout_s, camera, settled):
+    """Write (u, v, disparity) as seen in the middle of the exposure; left where that is behind.
+
+    The motion is small: its exponential to second order. All is divided by the depth.
+    """
+    fx, fy, cx, cy, baseline = camera[0], camera[1], camera[2], camera[3], camera[4]
+    for k in range(len(uvd)):
+        dt = readout_s * row_time(uvd[k, 1], camera)
+        a, b, c = _ray_rate(uvd[k], velocity, camera)
+        half = 0.5 * dt
+        x = dt * (a + half * (velocity[1] * c - velocity[2] * b))
+        y = dt * (b + half * (velocity[2] * a - velocity[0] * c))
+        z = dt * (c + half * (velocity[0] * b - velocity[1] * a)) + 1.0
+        if z > _MIN_DEPTH_M / (fx * baseline) * uvd[k, 2]:
+            settled[k, 0] = (uvd[k, 0] - cx + fx * x) / z + cx
+            settled[k, 1] = (uvd[k, 1] - cy + fy * y) / z + cy
+            settled[k, 2] = uvd[k, 2] / z
+        else:
+            for i in range(3):
+                settled[k, i] = uvd[k, i]
+
+
+@kernel(In("f8", 2), In("f8", 1), In("f8", 1), Out("f8", 2))
+def write_readout_rates(uvd, velocity, camera, rates):
+    """Write the derivatives of settled (u, v, disparity) by the readout time."""
+    for k in range(len(uvd)):
+        share = row_time(uvd[k, 1], camera)
+        a, b, c = _ray_rate(uvd[k], velocity, camera)
+        rates[k, 0] = share * (camera[0] * a - (uvd[k, 0] - camera[2]) * c)
+        rates[k, 1] = share * (camera[1] * b - (uvd[k, 1] - camera[3]) * c)
+        rates[k, 2] = -share * uvd[k, 2] * c
+
+
+@kernel(In("f8", 2), In("f8", 2), In("f8", 1), "f8", In("f8", 1), Out("f8", 3))
+def write_velocity_errors(points, uvd, sigmas, readout_s, camera, errors):
+    """Write by how much settled (u, v, disparity) err by a sigma of each axis: errors (6, n, 3)."""
+    J = np.empty((6, 3))
+    for k in range(len(points)):
+        write_pose_jacobian(points[k, 0], points[k, 1], points[k, 2], camera, J)
+        dt = readout_s * row_time(uvd[k, 1], camera)
+        for axis in range(6):
+            for i in range(3):
+                errors[axis, k, i] = dt * sigmas[axis] * J[axis, i]
