@@ -379,7 +379,7 @@ def test_a_pose_is_off_by_what_is_learnt_of_its_velocity_later() -> None:
     assert_velocity(third, mean)
     assert third.motion.measured is None
     change = (mean - measured.velocity) / sigmas
-    np.testing.assert_allclose(third.motion.error(), measured.found.effects @ change)
+    np.testing.assert_allclose(third.motion.error(), change @ measured.found.effects)
     # Where the next step fails, what was measured is the best that is known.
     note_step(third, fourth, None)
     assert_velocity(third, measured.velocity)

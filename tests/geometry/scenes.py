@@ -74,15 +74,14 @@ def matched(
     current_sigmas: ArrayLike = 1.0,
 ) -> Correspondences:
     """Return correspondences of points (n, 3), measured where they are projected by default."""
+    sigmas = [np.broadcast_to(each, reference.shape) for each in (reference_sigmas, current_sigmas)]
     return Correspondences(
-        reference_points=reference,
-        current_points=current,
+        reference_points=np.ascontiguousarray(reference),
+        current_points=np.ascontiguousarray(current),
         reference_uvd=project(reference) if reference_uvd is None else reference_uvd,
         current_uvd=project(current) if current_uvd is None else current_uvd,
-        reference_sigmas=np.broadcast_to(
-            np.asarray(reference_sigmas, dtype=float), reference.shape
-        ),
-        current_sigmas=np.broadcast_to(np.asarray(current_sigmas, dtype=float), reference.shape),
+        reference_sigmas=np.array(sigmas[0], dtype=np.float64, order="C"),
+        current_sigmas=np.array(sigmas[1], dtype=np.float64, order="C"),
     )
 
 
