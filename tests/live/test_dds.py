@@ -190,10 +190,6 @@ class Inbox:
         data, stamp_ns = self._came.get(timeout=HOLD_S)
         return decode(data, self.topic.type, is_ros1=False), stamp_ns
 
-    @property
-    def is_empty(self) -> bool:
-        return self._came.empty()
-
 
 def string(text: str) -> bytes:
     store = typestore(is_ros1=False)

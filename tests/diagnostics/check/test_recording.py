@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from gvo.config import Config
 from gvo.diagnostics.check import check_recording
-from gvo.io.bag.source import BagSource
 from gvo.io.opening import open_recording
 from gvo.testing import FaultySource
 from tests import faults as made
@@ -194,18 +193,6 @@ def test_damage_ends_the_reading_but_not_the_check() -> None:
     assert complaints(result) == {"reading"}
     assert find(result, "reading").value == "a.bag: truncated at 61 %"
     assert find(result, "depth: scale").verdict == "ok"
-
-
-@pytest.mark.parametrize(("n_changed", "verdict"), [(0, "ok"), (3, "warning")])
-def test_a_calibration_that_changes_on_the_way_is_told(
-    monkeypatch: pytest.MonkeyPatch, room_bag: Path, n_changed: int, verdict: str
-) -> None:
-    changes = {"/camera/camera_info": n_changed} if n_changed else {}
-    monkeypatch.setattr(BagSource, "camera_info_changes", changes)
-    source = open_recording(room_bag)
-    found = find(check_recording(source, Config(), n_samples=2), "changed CameraInfo")
-    assert found.verdict == verdict
-    assert ("3 of /camera/camera_info" in str(found.value)) == (n_changed > 0)
 
 
 @pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
