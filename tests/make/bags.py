@@ -29,10 +29,13 @@ Message = tuple[str, str, int, object]
 """Topic, type, log time in nanoseconds, and the message; or its bytes."""
 
 
-def write(path: Path, messages: Sequence[Message], *, compression: str = "") -> Path:
+def write(
+    path: Path, messages: Sequence[Message], *, compression: str = "", n_in_chunk: int = 0
+) -> Path:
     """Write a bag of ROS 1 (`.bag`) or ROS 2; of the latter return the file in its folder.
 
     A path without suffix is a folder. A type that nobody knows has a definition that is none.
+    Chunks of MCAP hold so many messages, those of ROS 1 about as many of 300 bytes.
     """
     is_ros1 = path.suffix == ".bag"
     store = typestore(is_ros1=is_ros1)
@@ -43,16 +46,20 @@ def write(path: Path, messages: Sequence[Message], *, compression: str = "") -> 
         writer.set_compression(Writer1.CompressionFormat[compression])
     elif compression:
         writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
+    if n_in_chunk and is_ros1:
+        writer.chunk_threshold = 333 * n_in_chunk
     foreign = {"msgdef": "no definition (", "md5sum" if is_ros1 else "rihs01": "RIHS01_" + "0" * 64}
     with writer:
         connections: dict[str, Any] = {}
-        for topic, type_, log_time_ns, message in messages:
+        for n, (topic, type_, log_time_ns, message) in enumerate(messages, 1):
             if topic not in connections:
                 known = {"typestore": store} if type_ in store.fielddefs else foreign
                 connections[topic] = writer.add_connection(topic, type_, **known)
             is_bytes = isinstance(message, bytes)
             data = message if is_bytes else serialize(message, type_, is_ros1=is_ros1)
             writer.write(connections[topic], log_time_ns, data)
+            if n_in_chunk and path.suffix == ".mcap" and n % n_in_chunk == 0:
+                writer.storage.close_chunk()
     if is_ros1 or not path.suffix:
         return path
     (file,) = path.with_suffix("").glob(f"{path.name}*")

@@ -4,13 +4,11 @@ import struct
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 from zlib import crc32
 
 from lz4.frame import compress as lz4_compress  # type: ignore[import-untyped]
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
-from rosbags.rosbag2 import Writer as Writer2
+
+from tests.make import bags
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -30,49 +28,10 @@ def contents(n: int, n_bytes: int = 300) -> list[Message]:
     ]
 
 
-def write_ros1(
-    path: Path, messages: list[Message], compression: str = "none", *, n_chunk: int = 1000
-) -> Path:
-    """Write a ROS 1 bag with chunks of about so many bytes."""
-    writer = Writer1(path)
-    if compression != "none":
-        writer.set_compression(Writer1.CompressionFormat[compression.upper()])
-    writer.chunk_threshold = n_chunk
-    _fill(writer, messages, md5sum="0" * 32)
-    return path
-
-
-def write_ros2(
-    path: Path, messages: list[Message], compression: str = "", *, n_in_chunk: int = 3
-) -> Path:
-    """Write a file of ROS 2 by its suffix, in a folder of its own."""
-    plugin = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
-    writer: Any = Writer2(path.with_suffix(""), version=9, storage_plugin=plugin)
-    if compression:
-        writer.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
-
-    def close_chunk(n: int) -> None:
-        if plugin is StoragePlugin.MCAP and n % n_in_chunk == 0:
-            writer.storage.close_chunk()
-
-    _fill(writer, messages, close_chunk, rihs01="RIHS01_" + "0" * 64)
-    return path.with_suffix("") / path.name
-
-
-def _fill(
-    writer: Any,
-    messages: list[Message],
-    after: Callable[[int], None] = lambda n: None,
-    **digest: str,
-) -> None:
-    with writer:
-        connections = {
-            name: writer.add_connection(name, _TYPE, msgdef="string data", **digest)
-            for name in TOPICS
-        }
-        for n, (name, log_time_ns, data) in enumerate(messages, 1):
-            writer.write(connections[name], log_time_ns, data)
-            after(n)
+def write(path: Path, messages: list[Message], compression: str = "") -> Path:
+    """Write a bag with small chunks; of ROS 2 in a folder of its own."""
+    typed: list[bags.Message] = [(name, _TYPE, ns, data) for name, ns, data in messages]
+    return bags.write(path, typed, compression=compression, n_in_chunk=3)
 
 
 def open_mcap(

@@ -21,8 +21,7 @@ from tests.io.bag.recovery.bags import (
     contents,
     damaged,
     open_mcap,
-    write_ros1,
-    write_ros2,
+    write,
 )
 
 _MESSAGES = contents(20)
@@ -31,17 +30,18 @@ _CLOSED = ("none.bag", "bz2.bag", "lz4.bag", "plain.mcap", "storage.mcap")
 _OPEN_AS = {"flat.mcap": None, "none.mcap": "", "lz4.mcap": "lz4", "zstd.mcap": "zstd"}
 _OPEN = tuple(_OPEN_AS)
 _KINDS = (*_CLOSED, *_OPEN)
-_DATABASE = "plain.db3"
+_DATABASE = "base.db3"
 
 
 @pytest.fixture(scope="module")
 def bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Return a whole bag of each kind."""
     folder = tmp_path_factory.mktemp("bags")
-    found = {name: write_ros1(folder / name, _MESSAGES, name[:-4]) for name in _CLOSED[:3]}
-    for name in (*_CLOSED[3:], _DATABASE):
-        compression = "storage" if name.startswith("storage") else ""
-        found[name] = write_ros2(folder / name[-3:] / name, _MESSAGES, compression)
+    found = {}
+    for name in (*_CLOSED, _DATABASE):
+        compression = name.partition(".")[0].upper()
+        compression = "" if compression in ("NONE", "PLAIN", "BASE") else compression
+        found[name] = write(folder / name, _MESSAGES, compression)
     for name, packed in _OPEN_AS.items():
         found[name] = folder / name
         found[name].write_bytes(open_mcap(_MESSAGES, packed))
@@ -252,7 +252,7 @@ def test_a_database_cut_anywhere_is_refused(bags: dict[str, Path], data: st.Data
 
 def test_pages_of_a_database_that_are_lost_are_told(tmp_path: Path) -> None:
     written = contents(200)
-    path = write_ros2(tmp_path / "a.db3", written)
+    path = write(tmp_path / "a.db3", written)
     n_pages = path.stat().st_size // 4096
     for page in range(1, n_pages):
         found = _try(damaged(path, partial(_fill_page, start=4096 * page)), written)
