@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice, takewhile
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -38,6 +38,8 @@ _DRIFT = 0.02
 # In a part that nothing connects with the first one, so many frames search all others; later ones
 # where they are places.
 _N_EAGER = 15
+# Observations and places, of the front-end's own kind.
+_Own: TypeAlias = Any
 _UNCONFIRMED = "no other loop confirms it"
 _AMBIGUOUS = "it fits several places"
 
@@ -46,7 +48,7 @@ _AMBIGUOUS = "it fits several places"
 class _Visit:
     """A place, and where odometry was when it was seen."""
 
-    place: Any
+    place: _Own
     T_world_frame: FloatArray
 
 
@@ -137,7 +139,7 @@ class LoopDetector:
 
     def look(
         self,
-        observations: Any,  # noqa: ANN401 - of the front-end's own kind
+        observations: _Own,
         T_world_frame: FloatArray,
         *,
         near: Container[int] = (),
@@ -169,16 +171,16 @@ class LoopDetector:
         confirmed = self._confirm(loops)
         return tuple(confirmed or self._confirm_alone(loops[0], place, observations))
 
-    def keep(self, observations: Any, T_world_frame: FloatArray) -> None:  # noqa: ANN401
+    def keep(self, observations: _Own, T_world_frame: FloatArray) -> None:
         """Add a frame of the latest part as a place, without looking."""
         self._add(self._describe(observations, is_dense=True), T_world_frame)
 
-    def _describe(self, observations: Any, *, is_dense: bool) -> Any:  # noqa: ANN401
+    def _describe(self, observations: _Own, *, is_dense: bool) -> _Own:
         plain = self._frontend.describe
         describe = getattr(self._frontend, "describe_densely", plain) if is_dense else plain
         return describe(observations)
 
-    def _add(self, place: Any, T_world_frame: FloatArray) -> None:  # noqa: ANN401
+    def _add(self, place: _Own, T_world_frame: FloatArray) -> None:
         visit = _Visit(place=place, T_world_frame=T_world_frame)
         self._visits[place.stamp_ns] = visit
         self._recent.append(visit)
@@ -219,12 +221,7 @@ class LoopDetector:
         return is_place or n_eager > 0
 
     def _register(
-        self,
-        visits: Iterable[_Visit],
-        place: Any,  # noqa: ANN401
-        observations: Any,  # noqa: ANN401
-        *,
-        is_search: bool = False,
+        self, visits: Iterable[_Visit], place: _Own, observations: _Own, *, is_search: bool = False
     ) -> list[Loop]:
         """Return the first loop; of a search all, since they may contradict each other."""
         loops = list[Loop]()
@@ -299,7 +296,9 @@ class LoopDetector:
             agreeing = [k for k in agreeing if self._allows(self.loops[k])]
             if len(agreeing) <= sum(vote < 0 for vote in votes.values()):
                 agreeing = []
-            self._note_search(loop, is_found=bool(agreeing))
+            if not agreeing and loop.reason != _AMBIGUOUS and self._allows(loop):
+                # The next frame may confirm it.
+                self._n_eager[self._part] = max(self._n_eager.get(self._part, 0), _N_WAITING)
         confirmed = [k for k in agreeing if self.loops[k].reason]
         self.loops.append(replace(loop, reason="") if agreeing else loop)
         for k in confirmed:
@@ -309,19 +308,7 @@ class LoopDetector:
     def _allows(self, loop: Loop) -> bool:
         return self._graph is None or self._graph.allows(loop)
 
-    def _note_search(self, loop: Loop, *, is_found: bool) -> None:
-        """Search rarely after a loop was found; eagerly while the next frame may confirm one."""
-        if is_found:
-            self._n_eager[self._part] = 0
-        elif loop.reason != _AMBIGUOUS and self._allows(loop):
-            self._n_eager[self._part] = max(self._n_eager.get(self._part, 0), _N_WAITING)
-
-    def _confirm_alone(
-        self,
-        loop: Loop,
-        place: Any,  # noqa: ANN401
-        observations: Any,  # noqa: ANN401
-    ) -> list[Loop]:
+    def _confirm_alone(self, loop: Loop, place: _Own, observations: _Own) -> list[Loop]:
         """Return the latest loop if the frame is found from a place beside, too, where it says.
 
         No other frame may follow that could tell. One that shows the same place tells no more than

@@ -415,21 +415,20 @@ class Odometry:
         """Return what depth alone measured beside links, where colour contradicts it."""
         if not links or not self._trust.is_due():
             return []
-        edges = [self._align_depth(observations, link) for link in links]
+        edges = []
+        for link in links:
+            T, keyframe = link.T_reference_frame, self._keyframes.kept[source_ns(link)]
+            depth = self._frontend.align_depth(keyframe.observations, observations, T)
+            if isinstance(depth, Failure):
+                continue
+            by_colour = RelativePose(T_reference_current=T, covariance=link.covariance)
+            self._trust.note(by_colour, depth)
+            if self._trust.is_on:
+                covariance = self._trust.variance_factor * depth.covariance
+                T = depth.T_reference_current
+                edges.append(replace(link, T_reference_frame=T, covariance=covariance))
         self._map.variance_factor = self._trust.variance_factor
-        return [edge for edge in edges if edge is not None]
-
-    def _align_depth(self, observations: _Observations, link: Edge) -> Edge | None:
-        """Measure a link again by depth alone; None where that is not believed."""
-        T, keyframe = link.T_reference_frame, self._keyframes.kept[source_ns(link)]
-        depth = self._frontend.align_depth(keyframe.observations, observations, T)
-        if isinstance(depth, Failure):
-            return None
-        self._trust.note(RelativePose(T_reference_current=T, covariance=link.covariance), depth)
-        if not self._trust.is_on:
-            return None
-        T, covariance = depth.T_reference_current, self._trust.variance_factor * depth.covariance
-        return Edge(reference_id=link.reference_id, T_reference_frame=T, covariance=covariance)
+        return edges
 
     def _smooth(self, step: RawStep, links: _Links) -> tuple[Estimate, FloatArray | None]:
         """Add a frame to the window; return its causal pose, and that in the frame before."""

@@ -1,6 +1,5 @@
 """The raw chain: first edges composed, whatever else is measured."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -64,19 +63,6 @@ def test_without_an_edge_the_last_velocity_goes_on() -> None:
     assert raw.status is Status.COASTING
     assert np.all(np.linalg.eigvalsh(raw.covariance - before.covariance)[-3:] > 0.1)
     assert chain.advance(causal(3), [edge(2, step)], None).status is Status.RESUMED
-
-
-def test_short_steps_without_an_edge_grow_as_unsure_as_a_long_one() -> None:
-    sigmas = []
-    for n_steps in (1, 10):
-        chain = EdgeChain()
-        chain.advance(causal(0), [], None)
-        chain.advance(causal(1), [edge(0, np.eye(4))], None)
-        for step in range(1, n_steps + 1):
-            late = replace(causal(1 + step), stamp_ns=SECOND + step * SECOND // n_steps)
-            raw = chain.advance(late, [], None)
-        sigmas.append(np.sqrt(raw.covariance[0, 0]))
-    assert sigmas[1] == pytest.approx(sigmas[0], rel=0.01)
 
 
 def test_without_an_edge_a_known_pose_begins_the_chain_anew() -> None:

@@ -94,15 +94,6 @@ def test_without_points_or_camera_the_score_is_the_proximity_of_the_poses() -> N
             assert kept.scores({7: shifted(dz=distance_m)}, 1) == {7: pytest.approx(score)}
 
 
-def test_samples_of_one_size_overlap_as_each_does_alone() -> None:
-    kept = keyframes(1, 2, 3)
-    kept.add(observations_of(4, wall(20)))
-    poses = {1: shifted(dx=1.0), 2: shifted(dz=-0.5), 3: np.eye(4)}
-    alone = {ns: kept.scores({ns: T}, 1)[ns] for ns, T in poses.items()}
-    assert kept.scores(poses, 1) == alone
-    assert kept.scores({**poses, 4: np.eye(4)}, 1) == {**alone, 4: 1.0}
-
-
 def chain(n: int, sigmas: FloatArray, rng: np.random.Generator) -> tuple[Estimate, Estimate]:
     """Return the 20th and the last pose of a chain of true steps and noise."""
     step = se3.exp(np.array([0.01, 0.03, 0.0, 0.1, 0.0, 0.8]))
