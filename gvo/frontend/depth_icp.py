@@ -20,11 +20,11 @@ ICRA 2016, doi:10.1109/ICRA.2016.7487211 (directions left open).
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 from functools import cached_property
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,21 +32,13 @@ from gvo.config import DepthConfig
 from gvo.frontend.rgbd import grid_points
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
+from gvo.kernels import depth as kernels
 from gvo.types import DepthArray, Failure, FloatArray, RelativePose, RgbdFrame
 
 # Columns of the reduced depth image, of means over four pixels each.
 _N_COLUMNS = 160
-# Normals are differences over so many columns on either side.
-_REACH = 2
-# Share by which inverse depths may differ from the plane through their neighbours.
-_MAX_BEND = 0.03
-# Every such point of the reference is matched.
-_STRIDE = 3
-# Noise of a depth camera: so many metres, and so many per metre squared.
-_SIGMA_M, _SIGMA_PER_M = 0.003, 0.003
 # Of each round, the largest residuals in sigmas, and one in how many points is enough.
 _ROUNDS = (*((4.0, 4),) * 2, *((2.5, 4),) * 3, (2.5, 1))
-_HUBER = 1.5
 _MIN_POINTS = 200
 # Of what the best direction is told, this share may come from the noise of the normals.
 _MIN_SHARE = 2e-3
@@ -67,14 +59,14 @@ class DepthMap:
     ----------
     inverse_depths : ndarray of float32, shape (h, w)
         Means of four pixels, 1/m; NaN where unknown or discontinuous.
-    camera : tuple of float
+    camera : ndarray of float64, shape (4,)
         fx, fy, cx, cy of the reduced image, pixels.
-    points, normals : ndarray of float64, shape (3, n)
+    points, normals : ndarray of float64, shape (n, 3)
         Points on smooth surfaces in the `cam` frame, metres, and unit normals.
     """
 
     inverse_depths: NDArray[np.float32]
-    camera: tuple[float, float, float, float]
+    camera: FloatArray
     points: FloatArray
     normals: FloatArray
 
@@ -82,51 +74,14 @@ class DepthMap:
     def of(cls, depth: DepthArray, camera: StereoCamera, config: DepthConfig) -> DepthMap:
         """Reduce a depth image of float32, shape (height, width), metres."""
         step = max(round(depth.shape[1] / (2 * _N_COLUMNS)), 1)
-        inverse = _reduce(depth[::step, ::step], config)
-        scale, shift = 0.5 / step, -0.5 * 0.5
-        reduced = (
-            scale * camera.fx,
-            scale * camera.fy,
-            scale * camera.cx + shift,
-            scale * camera.cy + shift,
-        )
-        points, normals = _planes(inverse, reduced)
-        return cls(inverse_depths=inverse, camera=reduced, points=points, normals=normals)
-
-
-def _reduce(depth: DepthArray, config: DepthConfig) -> NDArray[np.float32]:
-    """Return the mean inverse depths of two by two pixels; NaN at holes and steps."""
-    rows, columns = depth.shape[0] // 2 * 2, depth.shape[1] // 2 * 2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1.0 / depth[:rows, :columns]
-        a, b, c, d = inverse[::2, ::2], inverse[::2, 1::2], inverse[1::2, ::2], inverse[1::2, 1::2]
-        mean = 0.25 * (a + b + c + d)
-        spread = np.abs(a - mean) + np.abs(b - mean) + np.abs(c - mean) + np.abs(d - mean)
-        is_valid = spread < 4.0 * _MAX_BEND * mean
-        is_valid &= (mean * config.min_depth_m <= 1.0) & (mean * config.max_depth_m >= 1.0)
-    return np.where(is_valid, mean, np.float32(np.nan)).astype(np.float32)
-
-
-def _planes(
-    inverse: NDArray[np.float32], camera: tuple[float, float, float, float]
-) -> tuple[FloatArray, FloatArray]:
-    """Return every third point and its normal: a plane's inverse depth is linear in the pixel."""
-    fx, fy, cx, cy = camera
-    k, middle = _REACH, inverse[_REACH:-_REACH, _REACH:-_REACH]
-    left, right = inverse[k:-k, : -2 * k], inverse[k:-k, 2 * k :]
-    above, below = inverse[: -2 * k, k:-k], inverse[2 * k :, k:-k]
-    bend = np.maximum(np.abs(left + right - 2 * middle), np.abs(above + below - 2 * middle))
-    with np.errstate(invalid="ignore"):
-        v, u = np.nonzero(bend < _MAX_BEND * middle)
-    v, u = v[::_STRIDE], u[::_STRIDE]
-    at = middle[v, u].astype(np.float64)
-    x, y = (u + k - cx) / fx, (v + k - cy) / fy
-    # 1/z = a x + b y + c on the plane, of which (a, b, c) is the normal.
-    a = (right - left)[v, u] * (fx / (2 * k))
-    b = (below - above)[v, u] * (fy / (2 * k))
-    normals = np.stack([a, b, at - a * x - b * y])
-    rays = np.stack([x, y, np.ones_like(x)])
-    return rays / at, normals / np.linalg.norm(normals, axis=0)
+        height, width = (-(-n // step) // 2 for n in depth.shape)
+        inverse = np.empty((height, width), dtype=np.float32)
+        limits = config.min_depth_m, config.max_depth_m
+        kernels.reduce_depth(np.ascontiguousarray(depth), step, *limits, inverse)
+        reduced = 0.5 / step * camera.parameters[:4] - [0.0, 0.0, 0.25, 0.25]
+        points, normals = np.empty((2, height * width // kernels.STRIDE + 1, 3))
+        n = kernels.fit_surfaces(inverse, reduced, points, normals)
+        return cls(inverse_depths=inverse, camera=reduced, points=points[:n], normals=normals[:n])
 
 
 def align_depth_maps(
@@ -146,57 +101,19 @@ def align_depth_maps(
         Directions of motion that the planes leave open are those of the start value, with a large
         variance.
     """
-    T = se3.invert(T_reference_current)
+    T, H, g = np.array(T_reference_current), np.empty((6, 6)), np.empty(6)
+    surfaces = reference.points, reference.normals, current.inverse_depths, current.camera
     for gate, every in _ROUNDS:
-        system = _linearize(T, reference, current, gate=gate, every=every)
-        if isinstance(system, Failure):
-            return system
-        H, g, scale = system
+        n, squares = kernels.linearize_planes(T, *surfaces, gate, every, H, g)
+        if n * every < _MIN_POINTS:
+            return Failure(reason=f"{n} points of two depth images fit each other")
         inverse, open_inverse = _invert(H, reference)
-        T = se3.exp(inverse @ g) @ T
+        T = T @ se3.exp(inverse @ g)
+    scale = max(math.sqrt(squares / n), _MIN_SCALE)
     covariance = _N_CORRELATED * scale**2 * (inverse + open_inverse)
     return RelativePose(
-        T_reference_current=se3.normalize(se3.invert(T)),
-        covariance=0.5 * (covariance + covariance.T),
+        T_reference_current=se3.normalize(T), covariance=0.5 * (covariance + covariance.T)
     )
-
-
-def _linearize(
-    T: FloatArray, reference: DepthMap, current: DepthMap, *, gate: float, every: int
-) -> tuple[FloatArray, FloatArray, float] | Failure:
-    """Return the normal equations of a left perturbation of T, and the scale of the residuals."""
-    fx, fy, cx, cy = current.camera
-    points = T[:3, :3] @ reference.points[:, ::every] + T[:3, 3:]
-    normals = T[:3, :3] @ reference.normals[:, ::every]
-    z = np.maximum(points[2], 1e-3)
-    u, v = (f * row / z + c for f, row, c in ((fx, points[0], cx), (fy, points[1], cy)))
-    seen = _look_up(current.inverse_depths, u, v)
-    stretch = 1.0 / (seen * z) - 1.0
-    sigmas = _SIGMA_M + _SIGMA_PER_M * z * z
-    residuals = np.einsum("in,in->n", normals, points) * stretch / sigmas
-    # Of grazing views: what is measured lies on another surface, however small the residual.
-    is_near = (np.abs(residuals) < gate) & (np.abs(stretch) * z < 10.0 * sigmas + 0.03 * z)
-    chosen = np.flatnonzero(is_near)
-    if len(chosen) * every < _MIN_POINTS:
-        return Failure(reason=f"{len(chosen)} points of two depth images fit each other")
-    # Four times as fast as an index in brackets.
-    r, sigmas = residuals.take(chosen), sigmas.take(chosen)
-    x, y, z = points.take(chosen, axis=1)
-    J = np.empty((6, len(chosen)))
-    J[3:] = a, b, c = normals.take(chosen, axis=1)
-    J[:3] = y * c - z * b, z * a - x * c, x * b - y * a
-    J /= sigmas
-    weights = np.minimum(1.0, _HUBER / np.maximum(np.abs(r), 1e-9))
-    weighted = weights * J
-    scale = max(float(np.sqrt(np.mean(r * r))), _MIN_SCALE)
-    return weighted @ J.T, weighted @ r, scale
-
-
-def _look_up(image: NDArray[np.float32], u: FloatArray, v: FloatArray) -> FloatArray:
-    """Return values between the pixels; NaN beyond the image and beside unknown ones."""
-    pixels = (u.astype(np.float32)[np.newaxis], v.astype(np.float32)[np.newaxis])
-    values = cv2.remap(image, *pixels, cv2.INTER_LINEAR, borderValue=(np.nan,) * 4)
-    return np.asarray(values[0], dtype=np.float64)
 
 
 def _invert(H: FloatArray, reference: DepthMap) -> tuple[FloatArray, FloatArray]:
@@ -204,7 +121,7 @@ def _invert(H: FloatArray, reference: DepthMap) -> tuple[FloatArray, FloatArray]
 
     Rotations count as much as the translations of a point at the mean distance.
     """
-    units = np.r_[np.full(3, 1.0 / max(float(np.mean(reference.points[2])), 1e-3)), np.ones(3)]
+    units = np.r_[np.full(3, 1.0 / max(float(np.mean(reference.points[:, 2])), 1e-3)), np.ones(3)]
     values, vectors = np.linalg.eigh(units[:, np.newaxis] * H * units)
     vectors = units[:, np.newaxis] * vectors
     floor = _MIN_SHARE * values[-1]

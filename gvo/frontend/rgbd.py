@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 
 from gvo.config import DepthConfig
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
+from gvo.kernels import depth as kernels
 from gvo.types import (
     BoolArray,
     Contradiction,
     DepthArray,
     Failure,
     FloatArray,
-    IntArray,
     RelativePose,
 )
 
-# Share of known depths in a window that a plane is fitted to.
-_MIN_KNOWN_SHARE = 0.5
 # Points along each side of the grid that is compared.
 _N_GRID = 24
 # Largest difference of two depths that agree, sigmas.
@@ -63,74 +59,11 @@ def sample_depth(
         False where depth is unknown, out of range, or discontinuous around the keypoint: there
         a shift of a pixel between colour and depth changes the point by metres.
     """
-    pixels = np.rint(keypoints).astype(np.int64)
-    offsets = _offsets(config.edge_radius_px)
-    windows = _read_windows(depth, pixels, offsets)
-    depths = windows[len(offsets) // 2].astype(np.float64)
-    # fmin and fmax pass over NaN, and give it only where nothing else is.
-    lowest, highest = (ufunc.reduce(windows, axis=0) for ufunc in (np.fmin, np.fmax))
-    with np.errstate(invalid="ignore"):
-        is_smooth = highest - lowest <= config.max_edge_step * depths
-        is_in_range = (depths >= config.min_depth_m) & (depths <= config.max_depth_m)
-    is_valid = is_in_range & is_smooth
-    chosen = np.flatnonzero(is_valid & (lowest > 0))
-    fractions = (keypoints - pixels)[chosen]
-    fitted, is_fitted = _fit_planes(windows[:, chosen], offsets, fractions)
-    # Beside a hole or the border the plane continues, but not beyond all that was seen.
-    fitted = np.clip(fitted, lowest[chosen], highest[chosen])
-    depths[chosen] = np.where(is_fitted, fitted, depths[chosen])
+    depths, is_valid = np.empty(len(keypoints)), np.empty(len(keypoints), np.bool_)
+    limits = config.min_depth_m, config.max_depth_m, config.max_edge_step
+    given = np.ascontiguousarray(depth), np.ascontiguousarray(keypoints), config.edge_radius_px
+    kernels.sample_depths(*given, *limits, depths, is_valid)
     return depths, is_valid
-
-
-@lru_cache(maxsize=8)
-def _offsets(radius: int) -> IntArray:
-    """List (u, v) of the pixels of a window from its centre, shape ((2 * radius + 1)^2, 2)."""
-    rows, columns = np.mgrid[-radius : radius + 1, -radius : radius + 1]
-    return np.stack([columns.ravel(), rows.ravel()], axis=1)
-
-
-def _read_windows(depth: DepthArray, pixels: IntArray, offsets: IntArray) -> DepthArray:
-    """Return the depths around pixels, shape (m, n); NaN beyond the image."""
-    height, width = depth.shape
-    columns = pixels[:, 0] + offsets[:, :1]
-    rows = pixels[:, 1] + offsets[:, 1:]
-    is_inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    windows = depth.take(np.where(is_inside, rows * width + columns, 0))
-    windows[~is_inside] = np.nan
-    return windows
-
-
-def _fit_planes(
-    windows: DepthArray, offsets: IntArray, fractions: FloatArray
-) -> tuple[FloatArray, BoolArray]:
-    """Fit planes to windows of positive depths, m pixels of n keypoints.
-
-    Returns
-    -------
-    depths : ndarray of float64, shape (n,)
-        Of the planes at the keypoints, at fractions from the centre.
-    is_fitted : ndarray of bool, shape (n,)
-        False where too few depths are known.
-    """
-    is_known = ~np.isnan(windows)
-    inverse_depths = np.where(is_known, 1.0 / windows.astype(np.float64), 0.0)
-    u, v = offsets.T.astype(np.float64)
-    basis = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v])
-    sums = basis @ is_known
-    n_known = sums[0]
-    # Means, then the second moments about them: two slopes are left to solve for.
-    scale = 1.0 / np.maximum(n_known, 1.0)
-    _, mean_u, mean_v, uu, uv, vv = sums * scale
-    mean, us, vs = (basis[:3] @ inverse_depths) * scale
-    uu, uv, vv = uu - mean_u**2, uv - mean_u * mean_v, vv - mean_v**2
-    us, vs = us - mean_u * mean, vs - mean_v * mean
-    determinant = uu * vv - uv**2
-    is_fitted = (n_known > _MIN_KNOWN_SHARE * len(offsets)) & (determinant > 0)
-    du, dv = fractions[:, 0] - mean_u, fractions[:, 1] - mean_v
-    rise = (vv * us - uv * vs) * du + (uu * vs - uv * us) * dv
-    at_keypoints = mean + rise / np.where(is_fitted, determinant, 1.0)
-    is_fitted &= at_keypoints > 0
-    return 1.0 / np.where(is_fitted, at_keypoints, 1.0), is_fitted
 
 
 def check_depths(
@@ -230,17 +163,13 @@ def compare_depths(
         Disparity measured less disparity expected, in sigmas, of the n points that both frames
         measure; negative where the current frame sees farther.
     """
-    points = se3.transform_points(se3.invert(T_reference_current), points)
-    points = points[points[:, 2] > config.min_depth_m]
-    expected = camera.project_stereo(points)
-    height, width = depth.shape
-    seen = np.rint(expected[:, :2]).astype(np.int64)
-    is_inside = np.all((seen >= 0) & (seen < [width, height]), axis=1)
-    measured = depth[seen[is_inside, 1], seen[is_inside, 0]].astype(np.float64)
-    is_known = (measured >= config.min_depth_m) & (measured <= config.max_depth_m)
-    disparities = camera.depth_to_disparity(measured[is_known])
-    sigma = np.sqrt(2.0) * config.sigma_px
-    return np.asarray((disparities - expected[is_inside, 2][is_known]) / sigma)
+    differences = np.empty(len(points))
+    limits = config.min_depth_m, config.max_depth_m, config.sigma_px
+    n = kernels.compare_depths(
+        *(points, np.ascontiguousarray(depth), np.array(T_reference_current)),
+        *(camera.parameters, *limits, differences),
+    )
+    return differences[:n]
 
 
 def grid_points(depth: DepthArray, camera: StereoCamera, config: DepthConfig) -> FloatArray:
