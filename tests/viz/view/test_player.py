@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from itertools import islice
 
 import numpy as np
@@ -17,6 +17,7 @@ from gvo.odometry.odometry import Odometry
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, FrameResult, RgbdFrame
 from gvo.viz.view.player import Player
+from tests.make.recordings import Held, hold
 
 N_FRAMES = 8
 LIMIT_S = 60.0  # ends a test that hangs; none waits for it
@@ -41,26 +42,19 @@ class Recording:
         return self._walk.info
 
     def images(self) -> Iterator[StampedImage]:
-        return self._change(iter(rendered()))
+        return self._change(iter(walk().items))
 
     def ground_truth(self) -> Trajectory | None:
         return None
 
 
 @cache
-def rendered() -> tuple[StampedImage, ...]:
-    """Return the images of the walk, rendered once."""
-    loaded = [(image, image.load()) for image in walk().images()]
-    return tuple(replace(image, load=partial(np.copy, pixels)) for image, pixels in loaded)
-
-
-@cache
-def walk() -> SyntheticRecording:
-    return SyntheticRecording("handheld", "rgbd", n_frames=N_FRAMES, scale=0.3)
+def walk() -> Held:
+    return hold(SyntheticRecording("handheld", "rgbd", n_frames=N_FRAMES, scale=0.3))
 
 
 def stamps_ns() -> list[int]:
-    return [int(stamp_ns) for stamp_ns in walk().ground_truth().stamps_ns]
+    return [image.stamp_ns for image in walk().stream(0)]
 
 
 @cache
