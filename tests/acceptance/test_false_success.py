@@ -12,7 +12,7 @@ import pytest
 from gvo import Config, FrameResult, Odometry, SyntheticRecording, frames
 from gvo.geometry import se3
 from gvo.types import FloatArray, RgbdFrame, Status, StereoFrame
-from tests.make.recordings import Held
+from tests.make.recordings import Held, hold
 from tests.worlds import KINDS
 from tests.worlds.deceptive import traffic
 
@@ -56,9 +56,7 @@ def rendered(
         world = replace(KINDS[world], scene=partial(traffic, speed=speed))
     else:
         world = KINDS[world]
-    recording = SyntheticRecording(world, sensor, n_frames=n_frames, scale=scale, seed=seed)
-    items = [replace(image, load=cache(image.load)) for image in recording.images()]
-    return Held(info=recording.info, items=items, truth=recording.ground_truth())
+    return hold(SyntheticRecording(world, sensor, n_frames=n_frames, scale=scale, seed=seed))
 
 
 def track(held: Held, part: slice = slice(None), *, kind: str = "klt") -> Tracked:
