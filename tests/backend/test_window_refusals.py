@@ -274,6 +274,15 @@ def test_misuse_is_a_value_error_and_leaves_no_trace(misuse: str) -> None:
     assert found.window.counts.n_poses == N
 
 
+def test_a_first_pose_with_edges_is_misuse_and_the_window_can_still_begin() -> None:
+    window = SlidingWindow(CONFIG)
+    with pytest.raises(ValueError, match="'b'"):
+        window.add_pose("b", 0, [replace(GOOD[0], reference_id="a")])
+    assert len(window) == 0
+    assert window.newest is None
+    assert window.add_pose("b", 0, []).frame_id == "b"
+
+
 def test_an_unknown_choice_of_keyframes_is_misuse() -> None:
     with pytest.raises(ValueError, match="sometimes"):
         SlidingWindow(keyframes="sometimes")  # type: ignore[arg-type]
