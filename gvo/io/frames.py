@@ -21,6 +21,7 @@ from gvo.io.calibration.files import read_cameras
 from gvo.io.depth_registration import DepthRegistration
 from gvo.io.excerpt import Excerpt, take_excerpt
 from gvo.io.images import MILLIMETRES, depth_from_counts, depth_from_metres
+from gvo.io.png import compiled_png
 from gvo.io.recording import DepthView, RecordingInfo, Sensor, Source, StampedImage
 from gvo.io.sync import Paired, StampFilter, pair_images
 from gvo.types import DepthArray, FaultyFrame, Frame, ImageArray, RgbdFrame, StereoFrame
@@ -173,7 +174,9 @@ def _finish(item: Paired, jobs: _Jobs, sensor: Sensor) -> Frame | FaultyFrame:
 def _prepare(image: StampedImage, preparer: ImagePreparer, info: RecordingInfo) -> _Prepared:
     """Return the prepared image, or one line on what is wrong with it."""
     try:
-        return preparer(image.load())
+        with compiled_png():
+            pixels = image.load()
+        return preparer(pixels)
     except (RecordingError, *_LOAD_ERRORS) as error:
         return f"{info.stream_names[image.stream]} image: {_error_text(error)}"
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import re
 import stat
-import zlib
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo.errors import RecordingError
+from gvo.io.png import MAGIC, decode_plain_png, is_png_complete, size_of_png
 from gvo.types import DepthArray, ImageArray
 
 MAX_PIXELS = 100_000_000
@@ -23,15 +22,12 @@ MAX_PIXELS = 100_000_000
 
 # By their first bytes; OpenCV would decode other formats too, whose decoders are not bounded.
 _FORMATS = {
-    "PNG": re.compile(rb"\x89PNG\r\n\x1a\n"),
+    "PNG": re.compile(re.escape(MAGIC)),
     "JPEG": re.compile(rb"\xff\xd8\xff"),
     "TIFF": re.compile(rb"II\*\0|MM\0\*"),
     "BMP": re.compile(rb"BM"),
     "PNM": re.compile(rb"P[1-6]\s"),
 }
-_N_PNG_MAGIC = 8
-_PNG_END = b"IEND"
-_N_AT_ONCE = 4096  # bytes of which zlib makes a checksum without giving Python's lock away
 _JPEG_FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_BARE_MARKERS = frozenset({0x01, *range(0xD0, 0xD8)})  # no length follows
 _MAX_PIXELS_PER_BYTE = 2048  # twice what deflate makes of black, four times what JPEG does
@@ -138,15 +134,13 @@ def decode_image(data: NDArray[np.uint8], where: str) -> NDArray[Any]:
             f"begins with {start[:8]!r}"
         )
     if kind == "PNG":
-        size = (
-            int.from_bytes(data[16:20].tobytes(), "big"),
-            int.from_bytes(data[20:24].tobytes(), "big"),
-        )
-        _check_file(kind, size, _is_png_complete(data), len(data), where)
+        _check_file(kind, size_of_png(data), is_png_complete(data), len(data), where)
     elif kind == "JPEG":
         _check_file(kind, _jpeg_size(data), _is_jpeg_complete(data), len(data), where)
+    pixels = decode_plain_png(data) if kind == "PNG" else None
     try:
-        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+        if pixels is None:
+            pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     except cv2.error as error:  # more than OPENCV_IO_MAX_IMAGE_PIXELS, too
         raise RecordingError(f"{where}: the image cannot be decoded") from error
     if pixels is None or pixels.size == 0:
@@ -305,42 +299,7 @@ def _check_file(
         raise RecordingError(f"{where}: the {kind} image is truncated or damaged")
 
 
-def is_png(data: NDArray[np.uint8]) -> bool:
-    """Tell whether data begin as a PNG does."""
-    return _FORMATS["PNG"].match(data[:_N_PNG_MAGIC].tobytes()) is not None
-
-
 def _is_jpeg_complete(data: NDArray[np.uint8]) -> bool:
     """Tell whether a JPEG has its end; cameras fill their buffers up behind it."""
     end = b"\xff\xd9"
     return end in data[-1024:].tobytes() or end in data.tobytes().rstrip(b"\0")[-1024:]
-
-
-def _is_png_complete(data: NDArray[np.uint8]) -> bool:
-    """Tell whether the chunks of a PNG end before it does, those of its rows with their checksum.
-
-    OpenCV asks for the memory of a chunk, up to gigabytes, before it sees that there is no more.
-    """
-    return all(
-        end <= len(data) and _is_png_chunk_sound(data.data[start:end])
-        for _, start, end in _png_chunks(data)
-    )
-
-
-def _is_png_chunk_sound(chunk: memoryview) -> bool:
-    if chunk[4:8].tobytes() != b"IDAT":
-        return True
-    content, check = chunk[4:-4], 0
-    for first in range(0, len(content), _N_AT_ONCE):
-        check = zlib.crc32(content[first : first + _N_AT_ONCE], check)
-    return check == int.from_bytes(chunk[-4:], "big")
-
-
-def _png_chunks(data: NDArray[np.uint8]) -> Iterator[tuple[bytes, int, int]]:
-    """Yield the name of each chunk, and where it and its checksum begin and end."""
-    start, name = _N_PNG_MAGIC, b""
-    while start < len(data) and name != _PNG_END:
-        head = data.data[start : start + 8].tobytes()
-        name, end = head[4:], start + 12 + int.from_bytes(head[:4], "big")
-        yield name, start, end
-        start = end

@@ -92,14 +92,14 @@ def cache_folder() -> Path | None:
 
 @contextmanager
 def _cached_in(folder: Path | None) -> Iterator[None]:
-    """Let Numba keep what it compiles in a folder, one process at a time: the others wait."""
-    before, _config.CACHE_DIR = _config.CACHE_DIR, "" if folder is None else str(folder)
+    """Let Numba keep what it compiles in a folder, one thread at a time: the others wait."""
     lock = nullcontext() if folder is None else _locked(folder / "lock")
-    try:
-        with lock:
+    with lock:
+        before, _config.CACHE_DIR = _config.CACHE_DIR, "" if folder is None else str(folder)
+        try:
             yield
-    finally:
-        _config.CACHE_DIR = before
+        finally:
+            _config.CACHE_DIR = before
 
 
 @contextmanager

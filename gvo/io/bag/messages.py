@@ -28,9 +28,9 @@ from gvo.io.images import (
     decode_image,
     depth_from_counts,
     depth_from_metres,
-    is_png,
     to_8_bit,
 )
+from gvo.io.png import is_png
 from gvo.trajectory.formats import MAX_POSITION_M
 from gvo.types import DepthArray, Failure, FloatArray, ImageArray
 
