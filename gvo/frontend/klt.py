@@ -29,18 +29,16 @@ from gvo.frontend.stereo.matching import is_in_depth_range
 from gvo.frontend.stereo.patches import cut_patches
 from gvo.frontend.tracking import (
     N_WIDE_LEVELS,
-    RADIUS_PX,
     SPACING_PX,
     Templates,
     detect_corners,
     halve,
-    move_slopes,
-    patch_warps,
     track_pixels,
     track_roughly,
 )
-from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
+from gvo.kernels import prediction
+from gvo.kernels.templates import RADIUS_PX
 from gvo.types import (
     BoolArray,
     Contradiction,
@@ -56,7 +54,6 @@ from gvo.types import (
     StereoFrame,
 )
 
-_MIN_DEPTH_M = 1e-3
 # Standard deviations of a tracked pixel, and of the disparity of a corner or track, for stereo.
 _PIXEL_SIGMA_PX = 0.15
 _DISPARITY_SIGMA_PX = 0.15
@@ -393,24 +390,20 @@ class KltFrontend:
         self, T_reference_current: FloatArray, reference: KltReference, current: KltObservations
     ) -> Expected:
         """Return the corners that are in view of the current camera after a motion."""
-        corners = reference.corners
-        settled = self.calibrated.correct(reference, corners.uvd)
-        points = self.camera.unproject_stereo(settled[:, :2], settled[:, 2])
-        T_current_reference = se3.invert(T_reference_current)
-        points = se3.transform_points(T_current_reference, points)
-        in_front = np.flatnonzero(points[:, 2] > _MIN_DEPTH_M)
-        seen = self.calibrated.distort(current, self.camera.project_stereo(points[in_front]))
-        in_view = np.flatnonzero(self.camera.is_in_view(seen[:, :2]))
-        indices = in_front.take(in_view)
-        slopes, uvd = (each.take(indices, axis=0) for each in (corners.slopes, corners.uvd))
-        uvd[:, 2] -= self.rig_offsets.disparity_px
-        surfaces = uvd, slopes, T_current_reference, self.camera
+        corners, n = reference.corners, len(reference.corners.uvd)
+        indices, uvd, warps = np.empty(n, np.int64), np.empty((n, 3)), np.empty((n, 2, 2))
+        slopes = np.empty((n, 2))
+        n_seen = prediction.predict(
+            *(corners.uvd, corners.slopes, np.array(T_reference_current)),
+            *self.calibrated.bends(reference, current),
+            *(self.camera.parameters, indices, uvd, warps, slopes),
+        )
         return Expected(
             T_reference_current=T_reference_current,
-            indices=indices,
-            uvd=seen.take(in_view, axis=0),
-            warps=patch_warps(*surfaces),
-            slopes=move_slopes(*surfaces) if self._is_stereo else slopes,
+            indices=indices[:n_seen],
+            uvd=uvd[:n_seen],
+            warps=warps[:n_seen],
+            slopes=slopes[:n_seen],
         )
 
     def find_tracks(
@@ -449,8 +442,9 @@ class KltFrontend:
         expected: Expected,
         start: FloatArray,
     ) -> tuple[FloatArray, BoolArray]:
-        templates = reference.corners.templates.take(expected.indices)
-        pixels, is_found = templates.align(current.image, start, expected.warps)
+        templates = reference.corners.templates
+        searched = current.image, expected.indices, start, expected.warps
+        pixels, is_found = templates.align(*searched)
         return pixels, is_found & self.camera.is_in_view(pixels)
 
     def _measure(

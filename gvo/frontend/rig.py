@@ -60,6 +60,8 @@ _LEAST_CHANGE = 0.01
 _SHIFT_SHARE = 0.3
 # Gauss-Newton steps of a velocity that is measured.
 _N_ITERATIONS = 3
+# A velocity that is not known bends nothing.
+_AT_REST = np.zeros(6)
 # A row offset of the right image, the median of many measurements, that is worth a word.
 _LEAST_ROW_PX = 0.04
 # Stamps nearer to each other than this, in seconds, tell no velocity.
@@ -424,45 +426,6 @@ def describe_offsets(offsets: Mapping[str, Any] | None) -> str:
     return ", ".join(words)
 
 
-def settle_rows(
-    uvd: FloatArray, velocity: FloatArray | None, readout_s: float, camera: StereoCamera
-) -> FloatArray:
-    """Return what each row shows as seen in the middle of the exposure.
-
-    Row v of h is exposed at the stamp + readout * (v / h - 1/2). Until the stamp a point moves in
-    the camera's frame by exp(velocity * readout * (v / h - 1/2)).
-
-    Parameters
-    ----------
-    uvd : ndarray of float64, shape (n, 3)
-        Pixels and disparities.
-    velocity : ndarray of float64, shape (6,), or None
-        Twist of the camera per second (rad/s, m/s), right of its pose; None: left as they are.
-    readout_s : float
-        Negative: the inverse, from the middle of the exposure to when each row was exposed.
-    camera : StereoCamera
-
-    Returns
-    -------
-    ndarray of float64, shape (n, 3)
-    """
-    if velocity is None or readout_s == 0.0:
-        return uvd
-    settled = np.empty_like(uvd)
-    shutter.settle_rows(uvd, velocity, readout_s, camera.parameters, settled)
-    return settled
-
-
-def settling_rates(
-    uvd: FloatArray, velocity: FloatArray | None, camera: StereoCamera
-) -> FloatArray:
-    """Return the derivatives of what `settle_rows` gives by the readout time, shape (n, 3)."""
-    rates = np.zeros_like(uvd)
-    if velocity is not None:
-        shutter.write_readout_rates(uvd, velocity, camera.parameters, rates)
-    return rates
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Measurements:
     """What two frames show of the same n points.
@@ -509,13 +472,19 @@ class CalibratedCamera:
 
     def correct(self, observations: Moving, uvd: FloatArray) -> FloatArray:
         """Return measured (u, v, disparity), shape (n, 3), as a camera without errors has them."""
-        velocity, offset = observations.motion.velocity, [0.0, 0.0, self._offsets.disparity_px]
-        return settle_rows(uvd - offset, velocity, self._offsets.readout_s, self._camera)
+        velocity, offsets = observations.motion.velocity, self._offsets
+        readout_s, settled = offsets.readout_s, np.empty_like(uvd)
+        if velocity is None:
+            velocity, readout_s = _AT_REST, 0.0
+        camera = self._camera.parameters
+        shutter.settle_rows(uvd, offsets.disparity_px, velocity, readout_s, camera, settled)
+        return settled
 
-    def distort(self, observations: Moving, uvd: FloatArray) -> FloatArray:
-        """Return (u, v, disparity), shape (n, 3), as this camera measures them."""
-        velocity, offset = observations.motion.velocity, [0.0, 0.0, self._offsets.disparity_px]
-        return settle_rows(uvd, velocity, -self._offsets.readout_s, self._camera) + offset
+    def bends(self, reference: Moving, current: Moving) -> tuple[float, FloatArray, float]:
+        """Return what bends the measurements of two frames: offset, velocities (2, 6), readout."""
+        velocities = [each.motion.velocity for each in (reference, current)]
+        known = np.array([_AT_REST if each is None else each for each in velocities])
+        return self._offsets.disparity_px, known, self._offsets.readout_s
 
     def register(
         self, measured: Measurements, config: Config, *, prior: MotionPrior | None, is_step: bool
@@ -686,12 +655,12 @@ class CalibratedCamera:
             by_disparity = np.array([0.0, 0.0, learnt[DISPARITY].sigma])
             sensitivities[DISPARITY] = np.tile(by_disparity, (2, len(corrected), 1))
         if READOUT in learnt:
-            offset = [0.0, 0.0, self._offsets.disparity_px]
-            rates = [
-                settling_rates(uvd - offset, frame.motion.velocity, self._camera)
-                for frame, uvd in zip(measured.frames, measured.uvd, strict=True)
-            ]
-            sensitivities[READOUT] = -learnt[READOUT].sigma * np.stack(rates)
+            offset_px, velocities, _ = self.bends(*measured.frames)
+            rates = np.empty((2, len(corrected), 3))
+            for uvd, velocity, out in zip(measured.uvd, velocities, rates, strict=True):
+                camera = self._camera.parameters
+                shutter.write_readout_rates(uvd, offset_px, velocity, camera, out)
+            sensitivities[READOUT] = -learnt[READOUT].sigma * rates
         sigmas = measured.frames[1].motion.sigmas
         # What a readout that is not known yet may do counts, too.
         readout_s = self._offsets.possible_readout_s

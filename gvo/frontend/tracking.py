@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo.frontend.features import choose_spread
-from gvo.frontend.stereo.patches import cut_patches, steps_around
-from gvo.geometry.camera import StereoCamera
+from gvo.frontend.stereo.patches import cut_patches
+from gvo.kernels import templates
 from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 
 # Of Lucas-Kanade: at most 10 iterations, or a step of 0.01 pixels.
@@ -44,27 +44,6 @@ N_WIDE_LEVELS = 4
 _MAX_RETURN_PX = 0.5
 # Side of the square over which the gradients are summed, there.
 _BLOCK_PX = 3
-# Half size of the patches, and the offsets of their pixels, homogeneous.
-RADIUS_PX = 4
-_STEPS = np.vstack([steps_around(RADIUS_PX, RADIUS_PX), np.ones((2 * RADIUS_PX + 1) ** 2, "f4")])
-# Variance of a gradient that is noise, grey values squared: keeps flat patches from dividing by
-# nothing.
-_NOISE = 1.0
-# Distance to a plane, as a share of the reference's, below which the current camera is at it or
-# behind it; and the steepest slope that a surface has in the current image.
-_MIN_DISTANCE = 0.05
-_MAX_SLOPE = 0.75
-# An alignment makes so many steps; as many again are made by patches that the last of them moved by
-# more than this.
-_N_STEPS = 2
-_MOVING_PX = 0.03
-# A step of the alignment moves a patch by at most so much; it is at rest below so much.
-_MAX_STEP_PX = 1.0
-_MAX_LAST_STEP_PX = 0.2
-# Largest variance of the difference of matching patches: a share of the patch's variance, plus the
-# noise of the pixels, grey values squared.
-_MAX_UNLIKE = 0.5
-_UNLIKE_NOISE = 25.0
 
 
 def track_pixels(
@@ -227,187 +206,62 @@ def halve(image: ImageArray) -> ImageArray:
     return np.asarray(half, dtype=np.uint8)
 
 
-def patch_warps(
-    uvd: FloatArray, slopes: FloatArray, T_current_reference: FloatArray, camera: StereoCamera
-) -> FloatArray:
-    """Return by how much patches of surfaces are turned, stretched and sheared by a motion.
-
-    The surface at a pixel is a plane: its inverse depth is linear in the pixel. Then a pixel x,
-    in coordinates of the ray, goes to R x + t (n . x), divided by its third component.
-
-    Parameters
-    ----------
-    uvd : ndarray of float64, shape (n, 3)
-        Pixels of the reference and their disparities.
-    slopes : ndarray of float64, shape (n, 2)
-        Change of the disparity per pixel, along rows and columns; zero where a surface faces the
-        camera.
-    T_current_reference : ndarray of float64, shape (4, 4)
-        Motion, metres.
-    camera : StereoCamera
-        Of both.
-
-    Returns
-    -------
-    ndarray of float64, shape (n, 2, 2)
-        Derivative of the current pixel (u, v) by the reference's.
-    """
-    f = np.array([camera.fx, camera.fy])
-    rays = np.ones((len(uvd), 3))
-    rays[:, :2] = (uvd[:, :2] - [camera.cx, camera.cy]) / f
-    R, t = T_current_reference[:3, :3], T_current_reference[:3, 3]
-    inverse_depths = uvd[:, 2] / (camera.fx * camera.baseline)
-    points = rays @ R.T + inverse_depths[:, np.newaxis] * t
-    inverse_slopes = slopes / (camera.fx * camera.baseline)
-    # Of the points by the pixels, shape (n, 3, 2).
-    derivatives = R[:, :2] / f + t[:, np.newaxis] * inverse_slopes[:, np.newaxis]
-    z = points[:, 2, np.newaxis, np.newaxis]
-    directions = points[:, :2, np.newaxis] / z
-    warps = (derivatives[:, :2] - directions * derivatives[:, 2:]) / z
-    return np.asarray(warps * f[:, np.newaxis])
-
-
-def move_slopes(
-    uvd: FloatArray, slopes: FloatArray, T_current_reference: FloatArray, camera: StereoCamera
-) -> FloatArray:
-    """Return the slopes of the disparities of surfaces in the current image, shape (n, 2).
-
-    A plane n . p = 1, whose inverse depth is n . x for a ray x, becomes R n / (1 + t . R n).
-
-    Parameters
-    ----------
-    uvd : ndarray of float64, shape (n, 3)
-        Pixels of the reference and their disparities.
-    slopes : ndarray of float64, shape (n, 2)
-        Change of the disparity per pixel in the reference, along rows and columns.
-    T_current_reference : ndarray of float64, shape (4, 4)
-        Motion, metres.
-    camera : StereoCamera
-        Of both.
-    """
-    scales = np.array([1.0, camera.fy / camera.fx]) / camera.baseline
-    rays = (uvd[:, :2] - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-    normals = np.empty((len(uvd), 3))
-    normals[:, :2] = slopes * scales
-    inverse_depths = uvd[:, 2] / (camera.fx * camera.baseline)
-    normals[:, 2] = inverse_depths - np.einsum("ni,ni->n", normals[:, :2], rays)
-    normals = normals @ T_current_reference[:3, :3].T
-    distances = 1.0 + normals @ T_current_reference[:3, 3]
-    moved = normals[:, :2] / np.maximum(distances, _MIN_DISTANCE)[:, np.newaxis]
-    return np.clip(moved / scales, -_MAX_SLOPE, _MAX_SLOPE)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Templates:
-    """Square patches of a reference image, prepared for inverse compositional alignment.
-
-    Gradients and Hessian are those of the reference, computed once. Means are subtracted, so that
-    a difference of exposure has no effect.
+    """Square patches of a reference image, prepared to be aligned; see `gvo.kernels.templates`.
 
     Parameters
     ----------
     values : ndarray of float32, shape (n, s * s)
         Grey values less their mean.
     gradients : ndarray of float32, shape (n, 2, s * s)
-        Along rows and columns.
-    inverses : ndarray of float32, shape (n, 2, 2)
-        Inverse Hessians.
-
-    References
-    ----------
-    S. Baker, I. Matthews, "Lucas-Kanade 20 years on: a unifying framework", IJCV 56(3), 2004,
-    doi:10.1023/B:VISI.0000011205.11775.fd.
+        Along rows and columns, likewise.
+    inverses : ndarray of float64, shape (n, 4)
+        Inverse Hessians (00, 01, 11), and the variances of the values.
     """
 
     values: NDArray[np.float32]
     gradients: NDArray[np.float32]
-    inverses: NDArray[np.float32]
+    inverses: FloatArray
 
     @classmethod
     def of(cls, image: ImageArray, pixels: FloatArray) -> Templates:
         """Cut patches around whole pixels, shape (n, 2), out of an image."""
-        return cls.of_patches(cut_patches(image, pixels, RADIUS_PX + 1))
+        return cls.of_patches(cut_patches(image, pixels, templates.RADIUS_PX + 1))
 
     @classmethod
     def of_patches(cls, patches: NDArray[np.uint8]) -> Templates:
         """Prepare patches (n, 11, 11), which are one pixel wider on all sides."""
-        n, size = len(patches), 2 * RADIUS_PX + 1
-        wide = patches.astype(np.float32)
-        along = 0.5 * (wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2])
-        across = 0.5 * (wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1])
-        gradients = np.stack([along, across], axis=1).reshape(n, 2, size * size)
-        gradients -= gradients.mean(axis=2, keepdims=True)
-        values = wide[:, 1:-1, 1:-1].reshape(n, size * size)
-        hessians = np.matmul(gradients, np.swapaxes(gradients, 1, 2)) + _NOISE * np.eye(2)
-        return cls(
-            values=values - values.mean(axis=1, keepdims=True),
-            gradients=gradients,
-            inverses=np.linalg.inv(hessians).astype(np.float32),
-        )
-
-    def take(self, chosen: IntArray) -> Templates:
-        """Select patches by index."""
-        arrays = self.values, self.gradients, self.inverses
-        return Templates(*(each.take(chosen, axis=0) for each in arrays))
+        n, n_pixels = len(patches), (2 * templates.RADIUS_PX + 1) ** 2
+        values, gradients = np.empty((n, n_pixels), "f4"), np.empty((n, 2, n_pixels), "f4")
+        inverses = np.empty((n, 4))
+        templates.prepare(patches, values, gradients, inverses)
+        return cls(values, gradients, inverses)
 
     def align(
-        self, image: ImageArray, start: FloatArray, warps: FloatArray
+        self, image: ImageArray, indices: IntArray, start: FloatArray, warps: FloatArray
     ) -> tuple[FloatArray, BoolArray]:
-        """Find the patches in another image, near the start.
+        """Find some of the patches in another image, near the start.
 
         Parameters
         ----------
         image : ndarray of uint8, shape (height, width)
-        start : ndarray of float64, shape (n, 2)
+        indices : ndarray of int64, shape (m,)
+            Of the patches.
+        start : ndarray of float64, shape (m, 2)
             Pixels (u, v).
-        warps : ndarray of float64, shape (n, 2, 2)
-            See `patch_warps`.
+        warps : ndarray of float64, shape (m, 2, 2)
+            Derivatives of the image's pixels by those of the patches.
 
         Returns
         -------
-        pixels : ndarray of float64, shape (n, 2)
-        is_found : ndarray of bool, shape (n,)
+        pixels : ndarray of float64, shape (m, 2)
+        is_found : ndarray of bool, shape (m,)
             False where the search does not come to rest, or what it finds is unlike the patch.
         """
-        single = warps.astype(np.float32)
-        pixels, unlike, moves = self._steps(image, start, single)
-        moving = np.flatnonzero(moves > _MOVING_PX)
-        if len(moving):
-            more = self.take(moving)._steps(image, pixels[moving], single[moving])
-            pixels[moving], unlike[moving], moves[moving] = more
-        variances = np.einsum("ni,ni->n", self.values, self.values) / self.values.shape[1]
-        are_alike = unlike <= _MAX_UNLIKE * variances + _UNLIKE_NOISE
-        return pixels, are_alike & (moves < _MAX_LAST_STEP_PX)
-
-    def _steps(
-        self, image: ImageArray, start: FloatArray, warps: NDArray[np.float32]
-    ) -> tuple[FloatArray, NDArray[np.float32], FloatArray]:
-        """Return pixels after some steps, how unlike the patches are there, and the last moves."""
-        pixels = start.copy()
-        for _ in range(_N_STEPS):
-            # Its mean has no effect: that of the gradients is zero.
-            differences = sample_warped(image, pixels, warps) - self.values
-            slopes = np.einsum("nij,nj->ni", self.gradients, differences)
-            steps = np.einsum("nij,nj->ni", self.inverses, slopes)
-            clipped = np.clip(steps, -_MAX_STEP_PX, _MAX_STEP_PX)
-            moves = np.einsum("nij,nj->ni", warps, clipped)
-            pixels -= moves
-        differences -= differences.mean(axis=1, keepdims=True)
-        # What the last step explains of the difference is gone.
-        unlike = np.einsum("ni,ni->n", differences, differences)
-        unlike -= np.einsum("ni,ni->n", slopes, steps)
-        return pixels, unlike / self.values.shape[1], np.hypot(*moves.T)
-
-
-def sample_warped(
-    image: ImageArray, pixels: FloatArray, warps: NDArray[np.float32]
-) -> NDArray[np.uint8]:
-    """Return warped patches around pixels, shape (n, s * s), interpolated."""
-    n = len(pixels)
-    if n == 0:  # refused by OpenCV
-        return np.zeros((0, _STEPS.shape[1]), dtype=np.uint8)
-    places = np.empty((2, n, 3), dtype=np.float32)
-    places[:, :, :2], places[:, :, 2] = np.swapaxes(warps, 0, 1), pixels.T
-    columns, rows = places @ _STEPS
-    seen = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(seen, dtype=np.uint8)
+        pixels, is_found = np.array(start), np.empty(len(indices), np.bool_)
+        image = np.ascontiguousarray(image)
+        templates.align(
+            *(image, self.values, self.gradients, self.inverses, indices, warps, pixels, is_found)
+        )
+        return pixels, is_found

@@ -35,38 +35,47 @@ def row_time(v, camera):
     return v / camera[6] - 0.5
 
 
-@kernel(In("f8", 2), In("f8", 1), "f8", In("f8", 1), Out("f8", 2))
-def settle_rows(uvd, velocity, readout_s, camera, settled):
-    """Write (u, v, disparity) as seen in the middle of the exposure; left where that is behind.
+@helper
+def settle(uvd, velocity, readout_s, camera):
+    """Return (u, v, disparity) as seen in the middle of the exposure; as it is where behind.
 
-    The motion is small: its exponential to second order. All is divided by the depth.
+    A negative readout: the inverse. The motion is small: its exponential to second order. All is
+    divided by the depth.
     """
+    u, v, disparity = uvd
+    if readout_s == 0.0:
+        return u, v, disparity
     fx, fy, cx, cy, baseline = camera[0], camera[1], camera[2], camera[3], camera[4]
+    dt = readout_s * row_time(v, camera)
+    a, b, c = _ray_rate(uvd, velocity, camera)
+    half = 0.5 * dt
+    x = dt * (a + half * (velocity[1] * c - velocity[2] * b))
+    y = dt * (b + half * (velocity[2] * a - velocity[0] * c))
+    z = dt * (c + half * (velocity[0] * b - velocity[1] * a)) + 1.0
+    if not z > _MIN_DEPTH_M / (fx * baseline) * disparity:
+        return u, v, disparity
+    return (u - cx + fx * x) / z + cx, (v - cy + fy * y) / z + cy, disparity / z
+
+
+@kernel(In("f8", 2), "f8", In("f8", 1), "f8", In("f8", 1), Out("f8", 2))
+def settle_rows(uvd, offset_px, velocity, readout_s, camera, settled):
+    """Write (u, v, disparity) less an offset as seen in the middle of the exposure."""
     for k in range(len(uvd)):
-        dt = readout_s * row_time(uvd[k, 1], camera)
-        a, b, c = _ray_rate(uvd[k], velocity, camera)
-        half = 0.5 * dt
-        x = dt * (a + half * (velocity[1] * c - velocity[2] * b))
-        y = dt * (b + half * (velocity[2] * a - velocity[0] * c))
-        z = dt * (c + half * (velocity[0] * b - velocity[1] * a)) + 1.0
-        if z > _MIN_DEPTH_M / (fx * baseline) * uvd[k, 2]:
-            settled[k, 0] = (uvd[k, 0] - cx + fx * x) / z + cx
-            settled[k, 1] = (uvd[k, 1] - cy + fy * y) / z + cy
-            settled[k, 2] = uvd[k, 2] / z
-        else:
-            for i in range(3):
-                settled[k, i] = uvd[k, i]
+        measured = uvd[k, 0], uvd[k, 1], uvd[k, 2] - offset_px
+        u, v, disparity = settle(measured, velocity, readout_s, camera)
+        settled[k, 0], settled[k, 1], settled[k, 2] = u, v, disparity
 
 
-@kernel(In("f8", 2), In("f8", 1), In("f8", 1), Out("f8", 2))
-def write_readout_rates(uvd, velocity, camera, rates):
+@kernel(In("f8", 2), "f8", In("f8", 1), In("f8", 1), Out("f8", 2))
+def write_readout_rates(uvd, offset_px, velocity, camera, rates):
     """Write the derivatives of settled (u, v, disparity) by the readout time."""
     for k in range(len(uvd)):
         share = row_time(uvd[k, 1], camera)
-        a, b, c = _ray_rate(uvd[k], velocity, camera)
+        measured = uvd[k, 0], uvd[k, 1], uvd[k, 2] - offset_px
+        a, b, c = _ray_rate(measured, velocity, camera)
         rates[k, 0] = share * (camera[0] * a - (uvd[k, 0] - camera[2]) * c)
         rates[k, 1] = share * (camera[1] * b - (uvd[k, 1] - camera[3]) * c)
-        rates[k, 2] = -share * uvd[k, 2] * c
+        rates[k, 2] = -share * measured[2] * c
 
 
 @kernel(In("f8", 2), In("f8", 2), In("f8", 1), "f8", In("f8", 1), Out("f8", 3))

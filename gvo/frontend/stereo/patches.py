@@ -7,9 +7,9 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from gvo.kernels import sampling
 from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 
 # Half size of the patches that are compared between left and right, and how many columns are
@@ -87,10 +87,9 @@ def cut_patches(image: ImageArray, pixels: FloatArray, radius: int) -> NDArray[n
     -------
     ndarray of uint8, shape (n, 2 * radius + 1, 2 * radius + 1)
     """
-    size = 2 * radius + 1
-    padded = cv2.copyMakeBorder(image, *(radius,) * 4, cv2.BORDER_REPLICATE)
-    u, v = pixels.astype(np.int64).T
-    return np.asarray(sliding_window_view(padded, (size, size))[v, u])
+    patches = np.empty((len(pixels), 2 * radius + 1, 2 * radius + 1), np.uint8)
+    sampling.cut_patches(np.ascontiguousarray(image), np.ascontiguousarray(pixels), patches)
+    return patches
 
 
 @dataclass(frozen=True, slots=True, eq=False)
