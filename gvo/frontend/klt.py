@@ -23,14 +23,17 @@ from gvo.frontend.rig import (
     RigOffsets,
     note_step,
 )
-from gvo.frontend.stereo.corners import measure_corners
-from gvo.frontend.stereo.disparity import follow_disparities, measure_disparities
+from gvo.frontend.stereo.disparity import (
+    follow_disparities,
+    measure_corners,
+    measure_disparities,
+)
 from gvo.frontend.stereo.matching import is_in_depth_range
-from gvo.frontend.stereo.patches import cut_patches
 from gvo.frontend.tracking import (
     N_WIDE_LEVELS,
     SPACING_PX,
     Templates,
+    cut_patches,
     detect_corners,
     halve,
     track_pixels,

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo.frontend.features import choose_spread
-from gvo.frontend.stereo.patches import cut_patches
-from gvo.kernels import templates
+from gvo.kernels import sampling, templates
 from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 
 # Of Lucas-Kanade: at most 10 iterations, or a step of 0.01 pixels.
@@ -265,3 +264,15 @@ class Templates:
             *(image, self.values, self.gradients, self.inverses, indices, warps, pixels, is_found)
         )
         return pixels, is_found
+
+
+def cut_patches(image: ImageArray, pixels: FloatArray, radius: int) -> NDArray[np.uint8]:
+    """Return patches around whole pixels (n, 2) of an image, whose border is replicated.
+
+    Returns
+    -------
+    ndarray of uint8, shape (n, 2 * radius + 1, 2 * radius + 1)
+    """
+    patches = np.empty((len(pixels), 2 * radius + 1, 2 * radius + 1), np.uint8)
+    sampling.cut_patches(np.ascontiguousarray(image), np.ascontiguousarray(pixels), patches)
+    return patches

@@ -14,7 +14,7 @@ from gvo.frontend.klt import image_of
 from gvo.frontend.matching import best_ratios
 from gvo.frontend.rgbd import sample_depth
 from gvo.frontend.rig import RigOffsets
-from gvo.frontend.stereo.corners import measure_corners
+from gvo.frontend.stereo.disparity import measure_corners
 from gvo.frontend.stereo.matching import (
     candidate_pairs,
     compare_rows,
@@ -22,9 +22,9 @@ from gvo.frontend.stereo.matching import (
     match_stereo,
     refine_disparities,
 )
-from gvo.frontend.stereo.patches import PATCH_RADIUS_PX
 from gvo.frontend.tracking import WINDOW_RADIUS_PX, detect_corners, halve
 from gvo.geometry.camera import StereoCamera
+from gvo.kernels.stereo import RADIUS_PX
 from gvo.types import (
     BoolArray,
     FloatArray,
@@ -143,7 +143,7 @@ def explain_corner(
 ) -> Corner | None:
     """Follow one corner: along its row in the right image, or from the reference to the frame."""
     if isinstance(frame, StereoFrame):
-        images, radius = (frame.left, frame.right), PATCH_RADIUS_PX
+        images, radius = (frame.left, frame.right), RADIUS_PX
         sorting, kept = measured, np.flatnonzero(measured.are_kept)
     elif reference is None or found is None:
         return None

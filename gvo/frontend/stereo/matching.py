@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from gvo.config import StereoConfig
 from gvo.frontend.features import Features
 from gvo.frontend.matching import descriptor_distances, expand_ranges, select_matches
-from gvo.frontend.stereo.patches import PATCH_RADIUS_PX, SEARCH_RADIUS_PX
 from gvo.geometry.camera import StereoCamera
+from gvo.kernels.stereo import RADIUS_PX, REACH_PX
 from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 
 
@@ -89,7 +89,7 @@ def refine_disparities(
     """Fit the disparity of matches to a fraction of a pixel.
 
     A patch around the left pixel is compared with patches of the right image on the same row,
-    `SEARCH_RADIUS_PX` columns to either side; a parabola through the sum of squared
+    `REACH_PX` columns to either side; a parabola through the sum of squared
     differences (patch means removed) at the best column and its neighbours gives the fraction.
 
     Parameters
@@ -107,7 +107,7 @@ def refine_disparities(
     if config.subpixel == "none":
         disparities = pixels_left[:, 0] - pixels_right[:, 0]
         return disparities, np.ones(len(disparities), dtype=np.bool_)
-    radius, reach = PATCH_RADIUS_PX, SEARCH_RADIUS_PX
+    radius, reach = RADIUS_PX, REACH_PX
     columns = np.rint(pixels_right[:, 0]).astype(np.int64)
     column_left, row = np.rint(pixels_left).astype(np.int64).T
     # Patches, and the strips to search them in, lie in the images.
