@@ -7,13 +7,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gvo.config import StereoConfig
-from gvo.frontend.stereo.corners import (
-    COARSE_ERROR_PX,
+from gvo.frontend.stereo.disparity import (
     CornerDisparities,
     measure_corners,
     search_disparities,
 )
 from gvo.frontend.tracking import halve
+from gvo.kernels.stereo import COARSE_ERROR_PX
 from gvo.types import FloatArray, ImageArray
 from tests.frontend.analytic import SHAPE, grid, image, slanted_pair
 

@@ -1,5 +1,7 @@
 """Disparities of pixels, on images whose disparities are exact."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -12,6 +14,8 @@ from gvo.types import FloatArray, ImageArray
 from tests.frontend.analytic import MIDDLE, SHAPE, grid, image, slanted_pair
 
 CONFIG = StereoConfig()
+FACING = np.zeros((len(grid()), 2))
+STEPS: dict[str, Any] = {"n_steps": 3, "slopes": FACING}
 
 
 def pair(disparity: FloatArray | float, **right: float) -> tuple[ImageArray, ImageArray]:
@@ -93,7 +97,7 @@ def test_predicted_steps_lead_to_the_same(disparity: float, error: float, fracti
     pixels = grid() + fraction
     predicted = np.full(len(pixels), disparity + error)
     found, is_valid = follow_disparities(
-        pair(disparity, gain=0.95), pixels, predicted, CONFIG, n_steps=4
+        pair(disparity, gain=0.95), pixels, predicted, CONFIG, n_steps=4, slopes=FACING
     )
     assert is_valid.mean() > 0.75
     errors = found[is_valid] - disparity
@@ -111,7 +115,7 @@ def test_slanted_surfaces_are_right_with_slopes_wrong_without(slopes: tuple[floa
     found, is_valid = follow_disparities(
         images, pixels, expected + 0.3, CONFIG, n_steps=4, slopes=all_slopes
     )
-    facing, _ = follow_disparities(images, pixels, expected + 0.3, CONFIG, n_steps=4)
+    facing, _ = follow_disparities(images, pixels, expected + 0.3, CONFIG, n_steps=4, slopes=FACING)
     assert is_valid.mean() > 0.8
     errors, facing_errors = (each[is_valid] - expected[is_valid] for each in (found, facing))
     # OpenCV 4 interpolates at 32nds of a pixel.
@@ -122,15 +126,21 @@ def test_slanted_surfaces_are_right_with_slopes_wrong_without(slopes: tuple[floa
 
 def test_steps_that_do_not_come_to_rest_are_no_answer() -> None:
     predicted = np.full(len(grid()), 2.0)
-    _, is_valid = follow_disparities(pair(12.0), grid(), predicted, CONFIG, n_steps=3)
+    _, is_valid = follow_disparities(
+        pair(12.0), grid(), predicted, CONFIG, n_steps=3, slopes=FACING
+    )
     assert is_valid.mean() < 0.3
     flat = np.full(SHAPE, 90, dtype=np.uint8)
-    found, is_valid = follow_disparities((flat, flat), grid(), predicted, CONFIG, n_steps=3)
+    found, is_valid = follow_disparities(
+        (flat, flat), grid(), predicted, CONFIG, n_steps=3, slopes=FACING
+    )
     np.testing.assert_array_equal(found, predicted)  # nothing moves it
 
 
 def test_whole_disparities_are_found_from_a_prediction_too() -> None:
     config = StereoConfig(subpixel="none")
     predicted = np.full(len(grid()), 6.0)
-    found, is_valid = follow_disparities(pair(7.3), grid(), predicted, config, n_steps=3)
+    found, is_valid = follow_disparities(
+        pair(7.3), grid(), predicted, config, n_steps=3, slopes=FACING
+    )
     np.testing.assert_array_equal(np.unique(found[is_valid]), [7.0])
