@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from gvo.config import RansacConfig
-from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.umeyama import fit_rigid, fit_rigid_triples
+from gvo.kernels import consensus
 from gvo.types import BoolArray, Failure, FloatArray, IntArray
 
 # Hypotheses fitted and scored together, to amortize calls. Also the minimum number: any sample
@@ -147,44 +147,15 @@ def find_inliers(
     -------
     ndarray of bool, shape (m, n)
     """
-    # Single precision halves the time; its error (1e-4 px) is far below any threshold.
-    T = se3.invert(T_reference_current).astype(np.float32)
-    points = correspondences.reference_points.T.astype(np.float32)
-    R = T[:, :3, :3].transpose(1, 0, 2).reshape(-1, 3)
-    moved = (R @ points).reshape(3, len(T), -1)
-    moved += T[:, :3, 3].T[:, :, np.newaxis]
-    if config.inlier_metric == "distance":
-        measured = correspondences.current_points.T.astype(np.float32)
-        squared = np.sum((moved - measured[:, np.newaxis]) ** 2, axis=0)
-        return np.asarray(squared < config.inlier_threshold_m**2)
-    return _reprojects(moved, correspondences.current_uvd, camera, config.inlier_threshold_px)
-
-
-def _reprojects(
-    points: np.ndarray[tuple[int, ...], np.dtype[np.float32]],
-    uvd: FloatArray,
-    camera: StereoCamera,
-    threshold_px: float,
-) -> BoolArray:
-    """Compare projections of (3, m, n) points with measurements (n, 3)."""
-    x, y, z = points
-    u, v, d = (uvd - [camera.cx, camera.cy, 0.0]).T.astype(np.float32)
-    is_in_front = z > 1e-3
-    scaled = np.float32(camera.fx) / np.where(is_in_front, z, np.float32(1.0))
-    # In place from here: allocating is half of the cost.
-    error = x * scaled
-    error -= u
-    squared = error * error
-    np.multiply(y, scaled, out=error)
-    error *= np.float32(camera.fy / camera.fx)
-    error -= v
-    error *= error
-    squared += error
-    scaled *= np.float32(camera.baseline)
-    scaled -= d
-    scaled *= scaled
-    squared += scaled
-    return np.asarray(is_in_front & (squared < threshold_px**2))
+    inliers = np.empty((len(T_reference_current), len(correspondences)), np.bool_)
+    is_distance = config.inlier_metric == "distance"
+    threshold = config.inlier_threshold_m if is_distance else config.inlier_threshold_px
+    given = correspondences
+    consensus.find_inliers(
+        *(np.ascontiguousarray(T_reference_current), given.reference_points, given.current_points),
+        *(given.current_uvd, camera.parameters, threshold, is_distance, inliers),
+    )
+    return inliers
 
 
 def _refit(

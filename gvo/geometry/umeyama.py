@@ -11,9 +11,9 @@ B. Horn, "Closed-form solution of absolute orientation using unit quaternions", 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gvo.geometry.se3 import make_transform
+from gvo.kernels import consensus
 from gvo.types import BoolArray, Failure, FloatArray
 
 # Spread across the main direction over spread along it (standard deviations squared): below
@@ -70,8 +70,7 @@ def fit_rigid_batch(
 def fit_rigid_triples(points_a: FloatArray, points_b: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Fit one rigid transform to each of many triples of corresponding points.
 
-    As `fit_rigid_batch` in a fraction of its time: the best rotation maps one triangle's plane to
-    the other's, and the best angle in it is that of a sum of complex numbers.
+    As `fit_rigid_batch` in a fraction of its time; see `gvo.kernels.consensus`.
 
     Parameters
     ----------
@@ -85,26 +84,9 @@ def fit_rigid_triples(points_a: FloatArray, points_b: FloatArray) -> tuple[Float
     is_valid : ndarray of bool, shape (m,)
         False for points on a line, for NaN.
     """
-    # Vertices, coordinates, frames, triples: both frames in one go.
-    points = np.stack([points_b, points_a]).transpose(2, 3, 0, 1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        axes, a, b = _in_plane(points)
-        # Sum over the vertices, from the centres: frame a's times the conjugates of frame b's.
-        turn = a[0] * a[1] + np.conj(b[0]) * b[1]
-        turn -= np.conj(a[0] + b[0]) * (a[1] + b[1]) / 3.0
-        # Sum and product of the two singular values of the cross-covariance, times 3 and 9.
-        total, product = np.abs(turn), (a * b.imag).prod(axis=0) / 3.0
-        turn /= total
-        extent = np.abs(points).max(axis=(0, 1)).prod(axis=0)
-        is_valid = (total > 3.0 * _MIN_SPREAD_RATIO * extent) & np.isfinite(total)
-        is_valid &= product > _MIN_VARIANCE_RATIO * total**2
-        turned = axes[:, :, 1].copy()
-        turned[0] = turn.real * axes[0, :, 1] + turn.imag * axes[1, :, 1]
-        turned[1] = turn.real * axes[1, :, 1] - turn.imag * axes[0, :, 1]
-        R = np.einsum("aim,ajm->mij", turned, axes[:, :, 0])
-    R = np.where(is_valid[:, np.newaxis, np.newaxis], R, np.eye(3))
-    mean_b, mean_a = points.mean(axis=0).transpose(1, 2, 0)
-    return make_transform(R, mean_a - np.einsum("mij,mj->mi", R, mean_b)), is_valid
+    T, is_valid = np.empty((len(points_a), 4, 4)), np.empty(len(points_a), np.bool_)
+    consensus.fit_triples(points_a, points_b, T, is_valid)
+    return T, is_valid
 
 
 def fit_rigid(
@@ -148,23 +130,3 @@ def _normalized_weights(points: FloatArray, weights: FloatArray | None) -> Float
     total = np.sum(weights, axis=-1, keepdims=True)
     with np.errstate(invalid="ignore"):
         return np.asarray((weights / total)[..., np.newaxis])
-
-
-def _in_plane(points: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.complex128]]:
-    """Return the axes of triangles, shape (3, 3, ...), and two sides in their planes.
-
-    The first axis runs along the first side, the third along the normal. The first side is
-    its length, the second a complex number.
-    """
-    a, b = points[1] - points[0], points[2] - points[0]
-    normal = np.stack(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    )
-    length, area = np.sqrt((a * a).sum(axis=0)), np.sqrt((normal * normal).sum(axis=0))
-    first, third = a / length, normal / area
-    axes = np.empty((3, *first.shape))
-    axes[0], axes[2] = first, third
-    axes[1, 0] = third[1] * first[2] - third[2] * first[1]
-    axes[1, 1] = third[2] * first[0] - third[0] * first[2]
-    axes[1, 2] = third[0] * first[1] - third[1] * first[0]
-    return axes, length, (b * first).sum(axis=0) + 1j * (area / length)
