@@ -14,6 +14,7 @@ import pytest
 from hypothesis import settings
 
 import gvo
+from gvo.kernels.__main__ import compile_all
 
 # How long an example takes says something of the machine, nothing of the code. The examples are the
 # same each time, so that only a change can break a test; HYPOTHESIS_PROFILE=explore draws others,
@@ -26,6 +27,11 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "gvo"))
 # Tests with one of these marks may be skipped where what they need is missing; none in CI.
 _OPTIONAL = {"browser", "dds", "realsense", "recorded", "rerun", "ros1"}
 _IS_CI = os.environ.get("CI") == "true"
+
+
+def pytest_sessionstart() -> None:
+    """Compile the kernels once, of which a command would tell on standard error."""
+    compile_all()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -63,7 +63,8 @@ def kernel(*signature: types.Type | str) -> Callable[[Callable[..., Any]], Calla
             compiled = _njit(**_OPTIONS, cache=cache_folder() is not None)(function)
             compiled.compile(arguments)
         compiled.disable_compile()
-        _report(not compiled.stats.cache_hits)
+        if cache_folder() is not None:
+            _report(not compiled.stats.cache_hits)
         return compiled  # type: ignore[no-any-return]
 
     return decorate
