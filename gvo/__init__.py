@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from gvo.odometry.loops import LoopDetector as LoopDetector
     from gvo.odometry.odometry import Odometry as Odometry
     from gvo.runs.outputs.options import RunOutputs as RunOutputs
-    from gvo.runs.run import RunResult as RunResult
+    from gvo.runs.result import RunResult as RunResult
     from gvo.runs.run import run_recording as run_recording
     from gvo.runs.smooth import optimize as optimize
     from gvo.runs.smooth import smooth_edges as smooth_edges
@@ -74,7 +74,8 @@ _MODULES = {
     "gvo.viz.plots": ("plot_trajectories",),
     "gvo.io.poses.inputs": ("read_ground_truth",),
     "gvo.runs.outputs.options": ("RunOutputs",),
-    "gvo.runs.run": ("RunResult", "run_recording"),
+    "gvo.runs.result": ("RunResult",),
+    "gvo.runs.run": ("run_recording",),
     "gvo.runs.smooth": ("optimize", "smooth_edges"),
     "gvo.io.edges.opening": ("open_edges",),
     "gvo.io.excerpt": ("Excerpt",),

@@ -9,6 +9,10 @@ from tests.conftest import python
 
 BATCHES = ("dask", "distributed", "pandas", "pyarrow", "fsspec", "cryptography")
 HEAVY = ("matplotlib", "viser", "rerun", "selenium", *BATCHES)
+# The upper triangle of an identity, as pose graphs write it.
+_INFORMATION = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"
+# What compiles the loops of tracking.
+COMPILER = "numba"
 # Does one thing after the other; tells of each how it ended, and which of the libraries came by it.
 _PROGRAM = """
 import io, json, sys
@@ -36,14 +40,14 @@ for action in sys.argv[1:]:
         except SystemExit as end:
             code = end.code
     new = {{name.split(".")[0] for name in set(sys.modules) - before}}
-    found.append([code, sorted(new & set({heavy!r}))])
+    found.append([code, sorted(new & set({names!r}))])
 print(json.dumps(found))
 """
 
 
-def loaded_by(*actions: str) -> list[list[object]]:
+def loaded_by(*actions: str, names: tuple[str, ...] = HEAVY) -> list[list[object]]:
     """Return exit code and libraries loaded of each line of Python, in a process of their own."""
-    done = python("-c", _PROGRAM.format(heavy=HEAVY), *actions)
+    done = python("-c", _PROGRAM.format(names=names), *actions)
     assert (done.returncode, done.stderr) == (0, "")
     found: list[list[object]] = json.loads(done.stdout)
     return found
@@ -85,3 +89,23 @@ def test_batches_and_plots_load_what_they_need_alone(poses: Path, tmp_path: Path
     assert isinstance(loaded, list)
     assert "matplotlib" not in loaded
     assert plotted == [0, ["matplotlib"]]
+
+
+def test_tracking_alone_loads_compiled_loops(room_bag: Path, poses: Path, tmp_path: Path) -> None:
+    graph, page = tmp_path / "graph.g2o", tmp_path / "page.html"
+    graph.write_text(
+        "".join(f"VERTEX_SE3:QUAT {i} {i} 0 0 0 0 0 1\n" for i in range(3))
+        + "".join(f"EDGE_SE3:QUAT {i} {i + 1} 1 0 0 0 0 0 1 {_INFORMATION}\n" for i in range(2))
+    )
+    actions = [
+        command("--help"),
+        command("config"),
+        command("compare", poses, poses, "--report", page),
+        command("smooth", graph, "--out", tmp_path / "smoothed"),
+        command("smooth", graph, "--out", tmp_path / "by window", "--window"),
+        command("convert", room_bag, tmp_path / "folder", "--layout", "tum"),
+        f"track({str(room_bag)!r})",
+    ]
+    found = dict(zip(actions, loaded_by(*actions, names=(COMPILER,)), strict=True))
+    assert found.pop(actions[-1]) == [0, [COMPILER]]
+    assert found == {action: [0, []] for action in actions[:-1]}

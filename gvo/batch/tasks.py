@@ -20,7 +20,8 @@ from gvo.io.recording import Source
 from gvo.io.run_folder.reader import MAX_SUMMARY_BYTES
 from gvo.io.run_folder.writer import SUMMARY
 from gvo.runs.outputs.options import RunOutputs
-from gvo.runs.run import RunResult, run_recording
+from gvo.runs.result import RunResult
+from gvo.runs.run import run_recording
 from gvo.runs.summary import digest, run_identity
 from gvo.types import Progress
 

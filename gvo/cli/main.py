@@ -37,7 +37,7 @@ from gvo.errors import ConfigurationError, GvoError, OutputError, named_faults
 
 if TYPE_CHECKING:
     from gvo.io.edges.events import EdgeSource
-    from gvo.runs.run import RunResult
+    from gvo.runs.result import RunResult
 
 app = typer.Typer(
     name="gvo",

@@ -19,7 +19,7 @@ from typer.core import TyperCommand
 from gvo._text import cut, visible
 
 if TYPE_CHECKING:
-    from gvo.runs.run import RunResult
+    from gvo.runs.result import RunResult
     from gvo.types import Progress
 
 # Share by which the total of a progress bar may be off.
@@ -125,7 +125,7 @@ def report(result: RunResult, out: Path) -> NoReturn:
 
 def tell(result: RunResult, out: Path) -> None:
     """Print the result of a run."""
-    from gvo.frontend.rig import describe_offsets
+    from gvo.frontend.offsets import describe_offsets
     from gvo.io.run_folder.verdict import loop_words, verdict
     from gvo.trajectory.evaluation import format_evaluations
 

@@ -10,9 +10,10 @@ import numpy as np
 from gvo.config import Config
 from gvo.frontend.features import FeatureExtractor, Features, thin
 from gvo.frontend.matching import match_temporal, predict_pixels
+from gvo.frontend.offsets import RigOffsets
 from gvo.frontend.registration import check_view, match_anywhere, register_anywhere
 from gvo.frontend.rgbd import sample_depth
-from gvo.frontend.rig import CalibratedCamera, FrameMotion, Measurements, RigOffsets, note_step
+from gvo.frontend.rig import CalibratedCamera, FrameMotion, Measurements, note_step
 from gvo.frontend.stereo.matching import is_in_depth_range, match_stereo, refine_disparities
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.geometry.correspondences import Correspondences

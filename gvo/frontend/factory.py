@@ -8,7 +8,7 @@ from typing import Any
 from gvo.config import Config
 from gvo.frontend.descriptor import DescriptorFrontend
 from gvo.frontend.klt import KltFrontend, KltObservations
-from gvo.frontend.rig import RigOffsets
+from gvo.frontend.offsets import RigOffsets
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.types import Frame
 

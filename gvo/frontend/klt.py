@@ -13,16 +13,10 @@ from gvo.config import Config
 from gvo.frontend.depth_icp import DepthImage
 from gvo.frontend.descriptor import as_stereo
 from gvo.frontend.features import describe_pixels, thin
+from gvo.frontend.offsets import KLT_SIGMA_FACTOR, RigOffsets
 from gvo.frontend.registration import check_view, match_anywhere, register_anywhere
 from gvo.frontend.rgbd import check_depths, is_seen_again, sample_depth
-from gvo.frontend.rig import (
-    KLT_SIGMA_FACTOR,
-    CalibratedCamera,
-    FrameMotion,
-    Measurements,
-    RigOffsets,
-    note_step,
-)
+from gvo.frontend.rig import CalibratedCamera, FrameMotion, Measurements, note_step
 from gvo.frontend.stereo.disparity import (
     follow_disparities,
     measure_corners,

@@ -8,7 +8,7 @@ from typing import Any, Generic, Protocol, TypeAlias, TypeVar, runtime_checkable
 import numpy as np
 
 from gvo.config import Config
-from gvo.frontend.rig import RigOffsets
+from gvo.frontend.offsets import RigOffsets
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.types import Failure, FloatArray, MotionPrior, RelativePose, Stamped

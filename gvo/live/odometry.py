@@ -29,7 +29,8 @@ from gvo.odometry.odometry import Odometry
 from gvo.runs.loop import RunLoop
 from gvo.runs.outputs.bag import TOPICS
 from gvo.runs.outputs.options import RunOutputs, name_frames
-from gvo.runs.run import RunResult, drawn, run_recording
+from gvo.runs.result import RunResult
+from gvo.runs.run import drawn, run_recording
 from gvo.types import Failure, FaultyFrame, Progress, RgbdFrame, StereoFrame
 
 if TYPE_CHECKING:

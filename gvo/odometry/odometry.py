@@ -15,8 +15,8 @@ from gvo.config import Config
 from gvo.frontend.depth_icp import DepthTrust
 from gvo.frontend.descriptor import as_stereo
 from gvo.frontend.factory import find_change, frame_of, make_frontend
+from gvo.frontend.offsets import RigOffsets
 from gvo.frontend.protocol import CheckedFrontend, Frontend, count_points
-from gvo.frontend.rig import RigOffsets
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.odometry.chain import RawChain, RawStep

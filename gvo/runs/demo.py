@@ -16,7 +16,8 @@ from gvo.io.opening import open_recording
 from gvo.io.run_folder.line_file import check_new
 from gvo.io.run_folder.writer import check_unused
 from gvo.io.synthetic import SyntheticRecording
-from gvo.runs.run import RunResult, run_recording
+from gvo.runs.result import RunResult
+from gvo.runs.run import run_recording
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Progress
 

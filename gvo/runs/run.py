@@ -26,6 +26,7 @@ from gvo.io.run_folder.writer import GLOBAL, PICTURE, REPORT, RunFolder, save_su
 from gvo.runs.loop import Output, RunLoop, motions_of_window
 from gvo.runs.outputs.file import FileOutput
 from gvo.runs.outputs.options import RunOutputs
+from gvo.runs.result import RunResult
 from gvo.runs.summary import RunningSummary, optimum_json, run_identity, summarize
 from gvo.trajectory.alignment import MAX_DIFFERENCE_NS
 from gvo.trajectory.evaluation import Consistency, Evaluation, consistency, motions_of_chain
@@ -34,32 +35,6 @@ from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, Progress
 
 _LOGGER = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RunResult:
-    """The result of a run.
-
-    Parameters
-    ----------
-    summary : dict
-        As written to `summary.json`.
-    evaluations : tuple of Evaluation
-        Of raw, causal, smoothed and global poses; empty if there was no truth to compare with.
-    is_complete : bool
-        Whether no frame is missing, nearly all are tracked, and everything asked for was compared
-        and drawn.
-    warnings : tuple of str
-        One line each.
-    report : Path or None
-        The page that was written, if any.
-    """
-
-    summary: dict[str, Any]
-    evaluations: tuple[Evaluation, ...]
-    is_complete: bool
-    warnings: tuple[str, ...]
-    report: Path | None = None
 
 
 def run_recording(

@@ -19,7 +19,7 @@ from gvo.io.edges.lines import Request, format_error, format_estimate, parse_lin
 from gvo.io.edges.pose_graph import GRAPH, PoseGraphSource, write_graph
 from gvo.io.run_folder.writer import PICTURE, TRAJECTORIES, RunFolder, written_alone
 from gvo.odometry.chain import EdgeChain
-from gvo.runs.run import RunResult
+from gvo.runs.result import RunResult
 from gvo.runs.summary import peak_memory_mb
 from gvo.trajectory.evaluation import Evaluation, evaluate, evaluations_json
 from gvo.trajectory.formats import read_trajectory

@@ -12,7 +12,7 @@ import numpy as np
 
 from gvo.backend.batch import BatchResult
 from gvo.backend.window import WindowCounts
-from gvo.frontend.rig import RigOffsets
+from gvo.frontend.offsets import RigOffsets
 from gvo.types import FaultyFrame, FrameResult, Progress, SegmentJoin, Status
 
 # A run with a larger share of untracked poses is not complete.

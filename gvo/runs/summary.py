@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
 from dataclasses import asdict
-from typing import Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -22,10 +22,12 @@ from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.poses.truth import TruthComparison
 from gvo.io.recording import Source
 from gvo.io.run_folder.writer import RunFolder
-from gvo.runs.loop import RunLoop
 from gvo.trajectory.evaluation import evaluations_json
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, Optimum, Progress
+
+if TYPE_CHECKING:
+    from gvo.runs.loop import RunLoop
 
 State: TypeAlias = Literal["running", "interrupted", "complete"]
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from gvo.frontend.offsets import RigOffsets
 from gvo.frontend.protocol import CheckedFrontend, Frontend, Recognizer, find_fault
-from gvo.frontend.rig import RigOffsets
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.types import (

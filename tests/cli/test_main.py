@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 import gvo
-from gvo.frontend.rig import describe_offsets
+from gvo.frontend.offsets import describe_offsets
 from gvo.io.bag.source import BagSource
 from tests.conftest import (
     TABLES,

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from gvo.config import Config
 from gvo.frontend.descriptor import DescriptorFrontend, as_stereo
-from gvo.frontend.rig import RigOffsets
+from gvo.frontend.offsets import RigOffsets
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.types import (
     Failure,

@@ -12,8 +12,8 @@ from gvo.config import Config
 from gvo.frontend.descriptor import DescriptorFrontend
 from gvo.frontend.factory import make_frontend
 from gvo.frontend.klt import KltFrontend, KltObservations
+from gvo.frontend.offsets import DISPARITY, ConstantFilter
 from gvo.frontend.registration import check_view
-from gvo.frontend.rig import DISPARITY, ConstantFilter
 from gvo.geometry import se3
 from gvo.io.recording import Sensor
 from gvo.types import Failure, FloatArray, Frame, MotionPrior, RelativePose, RgbdFrame, StereoFrame

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from gvo.config import Config
+from gvo.frontend.offsets import RigOffsets
 from gvo.frontend.protocol import CheckedFrontend, count_points, find_fault
-from gvo.frontend.rig import RigOffsets
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera
 from gvo.types import Failure, FloatArray, MotionPrior, RelativePose

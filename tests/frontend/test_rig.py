@@ -17,15 +17,8 @@ import gvo
 from gvo.config import Config
 from gvo.frontend import klt
 from gvo.frontend.factory import make_frontend
-from gvo.frontend.rig import (
-    ConstantFilter,
-    FrameMotion,
-    MeasuredVelocity,
-    RigOffsets,
-    VarianceFactor,
-    describe_offsets,
-    note_step,
-)
+from gvo.frontend.offsets import ConstantFilter, RigOffsets, VarianceFactor, describe_offsets
+from gvo.frontend.rig import FrameMotion, MeasuredVelocity, note_step
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.refinement import Adjustment

@@ -12,7 +12,7 @@ import pytest
 
 from gvo.config import CameraConfig, Config, FrontendConfig
 from gvo.frontend.klt import KltFrontend
-from gvo.frontend.rig import RigOffsets
+from gvo.frontend.offsets import RigOffsets
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.odometry.odometry import Odometry

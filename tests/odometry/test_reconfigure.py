@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from gvo.config import Config
 from gvo.frontend.descriptor import DescriptorFrontend
 from gvo.frontend.klt import KltFrontend
-from gvo.frontend.rig import OFFSET_SIGMA_PX
+from gvo.frontend.offsets import OFFSET_SIGMA_PX
 from gvo.io.frames import frames
 from gvo.io.recording import Sensor
 from gvo.io.synthetic import SyntheticRecording

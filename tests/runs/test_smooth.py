@@ -17,7 +17,7 @@ from gvo.geometry import se3
 from gvo.io.edges.events import Event, InputFaults, PoseEvent
 from gvo.io.edges.opening import open_edges
 from gvo.io.run_folder.reader import read_run
-from gvo.runs.run import RunResult
+from gvo.runs.result import RunResult
 from gvo.runs.smooth import optimize_edges, smooth_edges
 from gvo.trajectory.formats import read_covariances, write_tum
 from gvo.trajectory.g2o import format_edge, format_vertex

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import gvo
 from gvo.errors import RecordingError
-from gvo.runs.run import RunResult
+from gvo.runs.result import RunResult
 from gvo.runs.smooth import smooth_lines
 
 

@@ -12,8 +12,8 @@ from gvo.diagnostics.explain.values import Corner, Registration, Sorting
 from gvo.frontend.features import FeatureExtractor
 from gvo.frontend.klt import image_of
 from gvo.frontend.matching import best_ratios
+from gvo.frontend.offsets import RigOffsets
 from gvo.frontend.rgbd import sample_depth
-from gvo.frontend.rig import RigOffsets
 from gvo.frontend.stereo.disparity import measure_corners
 from gvo.frontend.stereo.matching import (
     candidate_pairs,

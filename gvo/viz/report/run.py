@@ -12,7 +12,7 @@ import numpy as np
 from gvo._text import number_text
 from gvo.config import Config
 from gvo.errors import TrajectoryError
-from gvo.frontend.rig import describe_offsets
+from gvo.frontend.offsets import describe_offsets
 from gvo.io.run_folder.reader import RunRecord, Table, loop_ends
 from gvo.io.run_folder.verdict import loop_words, verdict
 from gvo.trajectory.alignment import AlignMode
