@@ -36,7 +36,9 @@ class Watched:
 
     def __init__(self, folder: Path) -> None:
         self.out, self.log = folder / "out", folder / "log.txt"
-        self.places = {name: folder / name for name in ("home", "cwd", "tmp", "matplotlib")}
+        self.places = {
+            name: folder / name for name in ("home", "cwd", "tmp", "matplotlib", "cache")
+        }
         for place in (self.out, *self.places.values()):
             place.mkdir(parents=True)
 
@@ -49,7 +51,7 @@ class Watched:
             "HOME": str(self.places["home"]),
             "TMPDIR": str(self.places["tmp"]),
             "MPLCONFIGDIR": str(self.places["matplotlib"]),
-            "XDG_CACHE_HOME": str(self.places["home"] / "cache"),
+            "XDG_CACHE_HOME": str(self.places["cache"]),
             "XDG_CONFIG_HOME": str(self.places["home"] / "config"),
             "PYTHONPATH": str(Path(gvo.__file__).parent.parent),
             "PYTHONDONTWRITEBYTECODE": "1",
@@ -71,7 +73,9 @@ class Watched:
     def assert_nothing_elsewhere(self, deeds: list[tuple[str, str]]) -> None:
         """Only `--out` and what is gone again was written to, and no socket was opened."""
         assert [what for kind, what in deeds if kind == "socket"] == []
-        allowed = (self.out, self.places["tmp"], self.places["matplotlib"])
+        # Compiled kernels are kept for the next run.
+        compiled = self.places["cache"] / "gvo"
+        allowed = (self.out, self.places["tmp"], self.places["matplotlib"], compiled)
         written = [Path(what) for kind, what in deeds if kind == "write"]
         assert any(path.is_relative_to(self.out) for path in written)
         elsewhere = {p for p in written if not any(p.is_relative_to(a) for a in allowed)}
