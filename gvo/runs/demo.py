@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import filecmp
+import logging
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,9 +20,10 @@ from gvo.io.run_folder.line_file import check_new
 from gvo.io.run_folder.writer import check_unused
 from gvo.io.synthetic import SyntheticRecording
 from gvo.runs.result import RunResult
-from gvo.runs.run import run_recording
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Progress
+
+_LOGGER = logging.getLogger(__name__)
 
 BAG_NAME = "drive.mcap"
 ROBOT_NAME = "robot.mcap"
@@ -115,6 +119,13 @@ def run_demo(
         When the folder holds something else of these names, or cannot be written.
     """
     check_place(out)
-    write_demo_bags(out, progress=on_rendered)
+    # Kernels are compiled, once on a machine, while the drive is rendered.
+    command = [sys.executable, "-m", "gvo.kernels"]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as compiler:  # noqa: S603
+        write_demo_bags(out, progress=on_rendered)
+        if compiler.poll() is None:
+            _LOGGER.warning("compiling, once on this machine")
+    from gvo.runs.run import run_recording
+
     source = open_recording(out / BAG_NAME)
     return run_recording(source, out, force=True, on_progress=on_progress, on_written=on_written)
