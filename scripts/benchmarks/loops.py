@@ -77,7 +77,9 @@ N_FIGURES = len(HEADER) + 1  # two columns hold two, and the name is none
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this sub-command."""
     recordings.add_options(parser)
-    parser.add_argument("--drift", type=percent, default=0.0, metavar="P", help="0 to 5 % of a lap")
+    parser.add_argument(
+        "--drift", type=percent, default=0.0, metavar="P", help="0 to 5 %% of a lap"
+    )
     parser.add_argument("--dark", type=span, metavar="A-B", help="seconds without light")
 
 

@@ -195,3 +195,8 @@ def test_what_cannot_be_measured_is_told_in_one_line(
     assert answer.code == 2
     assert message in answer.err.splitlines()[-1]
     assert "Traceback" not in answer.err
+
+
+def test_each_part_tells_how_it_is_used(benchmark: Benchmark) -> None:
+    for name in ("errors", "cost", "loops", "graphs", "map", "live"):
+        assert f"benchmark.py {name} [-h]" in benchmark(name, "--help")
