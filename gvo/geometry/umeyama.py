@@ -16,12 +16,6 @@ from gvo.geometry.se3 import make_transform
 from gvo.kernels import consensus
 from gvo.types import BoolArray, Failure, FloatArray
 
-# Spread across the main direction over spread along it (standard deviations squared): below
-# this, points lie on a line to 0.1 % and the rotation about it is noise.
-_MIN_VARIANCE_RATIO = 1e-6
-# Spread over distance from the origin (squared): below this, the spread is rounding.
-_MIN_SPREAD_RATIO = 1e-13
-
 
 def fit_rigid_batch(
     points_a: FloatArray, points_b: FloatArray, *, weights: FloatArray | None = None
@@ -57,8 +51,8 @@ def fit_rigid_batch(
     is_finite = np.isfinite(cross).all(axis=(-1, -2))
     U, singular_values, Vt = np.linalg.svd(np.where(is_finite[..., None, None], cross, 0.0))
     extent = np.abs(points_b).max(axis=(-1, -2)) * np.abs(points_a).max(axis=(-1, -2))
-    is_valid = is_finite & (singular_values[..., 0] > _MIN_SPREAD_RATIO * extent)
-    is_valid &= singular_values[..., 1] > _MIN_VARIANCE_RATIO * singular_values[..., 0]
+    is_valid = is_finite & (singular_values[..., 0] > consensus.MIN_SPREAD_RATIO * extent)
+    is_valid &= singular_values[..., 1] > consensus.MIN_VARIANCE_RATIO * singular_values[..., 0]
     signs = np.ones_like(singular_values)
     signs[..., 2] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))  # eq. 39: no reflection
     R = (U * signs[..., np.newaxis, :]) @ Vt  # eq. 40

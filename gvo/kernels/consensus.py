@@ -7,11 +7,11 @@ import numpy as np
 from gvo.kernels.jit import In, Out, helper, kernel
 from gvo.kernels.residuals import MIN_DEPTH_M, seen_from
 
-# Spread across the main direction over spread along it (standard deviations squared): below
-# this, points lie on a line to 0.1 % and the rotation about it is noise.
-_MIN_VARIANCE_RATIO = 1e-6
-# Spread over distance from the origin (squared): below this, the spread is rounding.
-_MIN_SPREAD_RATIO = 1e-13
+MIN_VARIANCE_RATIO = 1e-6
+"""Spread across the main direction over spread along it (standard deviations squared): below
+this, points lie on a line to 0.1 % and the rotation about it is noise."""
+MIN_SPREAD_RATIO = 1e-13
+"""Spread over distance from the origin (squared): below this, the spread is rounding."""
 
 
 @helper
@@ -54,9 +54,9 @@ def fit_triples(points_a, points_b, T, is_valid):
             for i in range(3):
                 farthest_a = max(farthest_a, abs(points_a[k, m, i]))
                 farthest_b = max(farthest_b, abs(points_b[k, m, i]))
-        is_spread = total > 3.0 * _MIN_SPREAD_RATIO * farthest_a * farthest_b
+        is_spread = total > 3.0 * MIN_SPREAD_RATIO * farthest_a * farthest_b
         # Sum and product of the two singular values of the cross-covariance, times 3 and 9.
-        is_wide = product / 3.0 > _MIN_VARIANCE_RATIO * total * total
+        is_wide = product / 3.0 > MIN_VARIANCE_RATIO * total * total
         is_valid[k] = is_spread and is_wide and total < np.inf
         cosine, sine = real / total, imaginary / total
         for i in range(3):

@@ -11,6 +11,7 @@ import numpy as np
 from gvo.kernels.jit import In, Out, kernel
 from gvo.kernels.linear import clear
 from gvo.kernels.residuals import MIN_DEPTH_M, seen_from
+from gvo.kernels.sampling import value_at
 
 REACH = 2
 """Normals are differences over so many pixels on either side."""
@@ -176,11 +177,7 @@ def linearize_planes(T, points, normals, inverse, camera, gate, every, H, g):
         u, v = camera[0] * x / z + camera[2], camera[1] * y / z + camera[3]
         if not (0.0 <= u < width - 1 and 0.0 <= v < height - 1):
             continue
-        i, j = int(u), int(v)
-        right, down = u - i, v - j
-        upper = (1.0 - right) * inverse[j, i] + right * inverse[j, i + 1]
-        lower = (1.0 - right) * inverse[j + 1, i] + right * inverse[j + 1, i + 1]
-        stretch = 1.0 / (((1.0 - down) * upper + down * lower) * z) - 1.0
+        stretch = 1.0 / (value_at(inverse, u, v) * z) - 1.0
         sigma = _SIGMA_M + _SIGMA_PER_M * z * z
         p, q, s = normals[k, 0], normals[k, 1], normals[k, 2]
         a = T[0, 0] * p + T[1, 0] * q + T[2, 0] * s

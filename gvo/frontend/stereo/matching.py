@@ -175,12 +175,7 @@ def parabola_minimum(values: NDArray[np.float32]) -> tuple[FloatArray, BoolArray
     is_minimum : ndarray of bool, shape (n,)
         False where the smallest sample is the first or last.
     """
-    return parabola_vertex(values, np.argmin(values, axis=1))
-
-
-def parabola_vertex(values: NDArray[np.float32], best: IntArray) -> tuple[FloatArray, BoolArray]:
-    """As `parabola_minimum`, of curves whose smallest or largest samples (n,) are known."""
-    n, m = values.shape
+    (n, m), best = values.shape, np.argmin(values, axis=1)
     inner = np.minimum(np.maximum(best, 1), m - 2)
     places = m * np.arange(n) + inner
     samples = values.ravel()[np.stack([places - 1, places, places + 1])]
