@@ -198,7 +198,8 @@ def drive(recording: str) -> None:
         interfere(index, pair[0].stamp_ns, writer.open(streams[0].topic, IMAGE_TYPE))
         for image in pair:
             stream = streams[image.stream]
-            writer.tick(image.stamp_ns)
+            # A message without a header has the time of its arrival, which no image may have.
+            writer.tick(image.stamp_ns + 1_000_000)
             header = Header(image.stamp_ns, stream.frame_id)
             write_image(writer, stream.topic, image.load(), header)
         if index == 0:
