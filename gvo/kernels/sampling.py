@@ -9,8 +9,10 @@ from gvo.kernels.jit import In, Out, helper, kernel
 
 @helper
 def value_at(image, x, y):
-    """Return one value of an image."""
+    """Return one value of an image; NaN at NaN."""
     height, width = image.shape
+    if np.isnan(x) or np.isnan(y):
+        return np.nan
     x, y = min(max(x, 0.0), width - 1.0), min(max(y, 0.0), height - 1.0)
     i, j = int(x), int(y)
     after, below = min(i + 1, width - 1), min(j + 1, height - 1)

@@ -36,8 +36,9 @@ _UNLIKE_NOISE = 25.0
 def prepare(patches, values, gradients, inverses):
     """Prepare patches that are one pixel wider on all sides.
 
-    Write grey values (n, s * s) and gradients along rows and columns (n, 2, s * s), less their
-    means, and the inverse Hessian (00, 01, 11) with the variance of the values, (n, 4).
+    Write grey values (n, s * s) and gradients G along rows and columns (n, 2, s * s), less their
+    means, and the inverse (00, 01, 11) of the Hessian H = G G' + noise with the variance of the
+    values, (n, 4). Gradients are half the difference of the pixels on either side.
     """
     for k in range(len(patches)):
         patch = patches[k]
@@ -73,8 +74,10 @@ def prepare(patches, values, gradients, inverses):
 def align(image, values, gradients, inverses, indices, warps, pixels, is_found):
     """Move pixels (m, 2) to where the patches of these indices are in an image.
 
-    Warps (m, 2, 2) are the derivatives of the image's pixels by those of the patch. Write which are
-    found: not what does not come to rest, or is unlike its patch.
+    Warps W (m, 2, 2) are the derivatives of the image's pixels by those of the patch. A step takes
+    W H^-1 G d off a pixel: d is the difference between the image at the pixel + W (i, j), |i| and
+    |j| <= radius, and the patch. Write which are found: not what does not come to rest, or is
+    unlike its patch, by the variance of d without (G d)' H^-1 G d, which the step explains.
     """
     seen = np.empty(_N_PIXELS)
     for k in range(len(indices)):
