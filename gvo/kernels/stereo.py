@@ -89,7 +89,8 @@ def _largest(values, n):
 def _correlate(left, right, column, row, n_steps, scores):
     """Write the normalized correlations of a patch at disparities n_steps .. 0.
 
-    -1 where the place is left of the right image.
+    a . b / sqrt(a . a  b . b) of patches less their means, energies no less than the noise; -1
+    where the place is left of the right image.
     """
     height, width = left.shape
     patch, n_pixels, mean = np.empty((_COARSE_SIDE, _COARSE_SIDE)), _COARSE_SIDE**2, 0.0
@@ -129,8 +130,9 @@ def _correlate(left, right, column, row, n_steps, scores):
 def search(left, right, pixels, max_disparity, disparities, is_found, rivals):
     """Find the disparities of whole pixels (n, 2) to a few pixels, by normalized correlation.
 
-    Left and right are of a quarter of the size. Rivals (n, 3) are other disparities that correlate
-    nearly as well, the best one first, else NaN.
+    Left and right are of a quarter of the size. Of all steps from the largest disparity to zero the
+    first that correlates best is taken, between steps by a parabola. Rivals (n, 3) are what is
+    best, and nearly as good, without the peaks before; else NaN.
     """
     height, width = left.shape
     n_steps = min(int(np.ceil(max_disparity / REDUCTION)), width)
@@ -213,7 +215,8 @@ def _follow(weights, at_rest, strip, place, n_steps, max_step):
             after = _shift_at(weights, at_rest, strip, whole + 1)
         step = before + (place - whole) * (after - before)
         step = min(max(step, -max_step), max_step)
-        place = min(max(place - step, 0.0), _N_PLACES - 1.0)
+        # In this order NaN becomes zero: it is no place. The step tells.
+        place = min(max(0.0, place - step), _N_PLACES - 1.0)
     return place, step
 
 
@@ -247,9 +250,11 @@ def _variance(a, b):
 def _fit_plane(wide, patch, right, u, row, basis, H, seen, plane):
     """Fit the disparity of a surface with its slopes: plane (disparity, along, across).
 
-    The right patch is interpolated, and blurred by that: without a parameter for it, edges would
-    look stretched. Write the patch seen before the last step. Return whether the surface is not too
-    steep to be seen by both cameras, nor too far from where one that faces them would be.
+    By Gauss-Newton steps with priors: pixel (i, j) of the patch is seen at the column
+    u - disparity + (1 - along) i - across j. The right patch is interpolated, and blurred by that:
+    without a parameter for it, the second derivative along rows, edges would look stretched. Write
+    the patch seen before the last step. Return whether the surface is not too steep to be seen by
+    both cameras, nor too far from where one that faces them would be.
     """
     stride, m, pull, start = _SIDE + 2, 0, np.empty(4), plane[0]
     for j in range(-RADIUS_PX, RADIUS_PX + 1):
