@@ -61,6 +61,7 @@ def package(tmp_path: Path) -> Path:
 
 def started(package: Path, program: str = _CALL, **environment: str) -> subprocess.Popen[str]:
     home = {"XDG_CACHE_HOME": str(package / "cache"), "PYTHONPATH": str(package)}
+    home["NUMBA_DISABLE_JIT"] = "0"
     return subprocess.Popen(
         [sys.executable, "-c", program],
         stdin=subprocess.PIPE,

@@ -72,7 +72,7 @@ def test_the_coarse_search_takes_peaks_of_correlation(n: int, max_disparity: flo
     left = texture(rng, (20, 32), blur=0.8)
     left[:8] = np.tile(left[:8, :5], 7)[:, :32]
     right = shifted(rng, left, np.eye(2), (-4.3, 0.0))
-    left[-6:, -6:] = 100  # flat
+    left[-6:, -6:], right[8:14] = 100, 100 + right[8:14] // 32  # flat, and nearly so
     pixels = rng.integers([0, 0], [130, 82], (n, 2)).astype(float)
     pixels[:3] = np.reshape([0.0, 0, 131, 83, 126, 79], (3, 2))[:n]
     found, is_found, rivals = np.full(n, 7.0), np.ones(n, np.bool_), np.full((n, 3), 7.0)
