@@ -27,6 +27,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from gvo.config import FeaturesConfig
+from gvo.kernels import corners
 from gvo.types import FloatArray, ImageArray, IntArray
 
 Descriptors = NDArray[np.uint8] | NDArray[np.float32]
@@ -216,25 +217,10 @@ def choose_spread(
     ndarray of int64, shape (m,)
         Indices, sorted.
     """
-    columns = -(-width // cell_size_px)
-    # Cells and ranks are small integers, which NumPy sorts stably in linear time.
-    cells = (pixels // cell_size_px) @ [1, columns]
-    cells = cells.astype(np.uint16 if cells.max(initial=0) < 1 << 16 else np.uint32)
-    by_response = np.argsort(-responses, kind="stable")
-    by_cell = np.argsort(cells[by_response], kind="stable")
-    ranks = np.empty(len(pixels), dtype=np.uint16)
-    ranks[by_cell] = np.minimum(rank_in_group(cells[by_response][by_cell]), 65535)
-    # The first of every cell before the second of any: the weakest rank is cut by response.
-    return np.sort(by_response[np.argsort(ranks, kind="stable")[:n_chosen]])
-
-
-def rank_in_group(sorted_groups: NDArray[Any]) -> IntArray:
-    """Return the rank of the members of each run of equal values, from zero, shape (n,)."""
-    n = len(sorted_groups)
-    is_first = np.ones(n, dtype=np.bool_)
-    is_first[1:] = sorted_groups[1:] != sorted_groups[:-1]
-    starts = np.flatnonzero(is_first)
-    return np.asarray(np.arange(n) - starts[np.cumsum(is_first) - 1])
+    order, chosen = np.argsort(-responses, kind="stable"), np.empty(len(pixels), np.int64)
+    pixels = np.ascontiguousarray(pixels, dtype=np.float64)
+    n = corners.spread(pixels, order, width, cell_size_px, n_chosen, chosen)
+    return chosen[:n]
 
 
 def _typed(descriptors: NDArray[Any], kind: str) -> Descriptors:

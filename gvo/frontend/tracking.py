@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo.frontend.features import choose_spread
-from gvo.kernels import sampling, templates
+from gvo.kernels import corners, sampling, templates
 from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 
 # Of Lucas-Kanade: at most 10 iterations, or a step of 0.01 pixels.
@@ -25,11 +25,6 @@ _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.01)
 # The backward track starts at its goal and needs no pyramid: a wrong one does not find the first
 # corner anyway.
 _BACK_LEVELS = 0
-# Corners are detected at half resolution, at a quarter of the cost: a patch need not be centred on
-# its corner exactly, as it is tracked and measured wherever it is.
-_REDUCTION = 2
-# Smallest eigenvalue of a corner's gradient covariance, grey in [0, 1]: below it noise is tracked.
-_MIN_EIGENVALUE = 1e-4
 # Sides of the cells with at most one corner each, and of those that share the number of corners.
 SPACING_PX = 10
 CELL_SIZE_PX = 40
@@ -41,8 +36,6 @@ _N_HALF_LEVELS = 1
 N_WIDE_LEVELS = 4
 # Largest error of a track that is followed back to its corner.
 _MAX_RETURN_PX = 0.5
-# Side of the square over which the gradients are summed, there.
-_BLOCK_PX = 3
 
 
 def track_pixels(
@@ -152,46 +145,21 @@ def detect_corners(
     ndarray of float64, shape (n, 2)
         Whole pixels (u, v), with room for the window that is tracked.
     """
-    border = (WINDOW_RADIUS_PX + 1) // _REDUCTION + 1
-    if min(image.shape) // _REDUCTION <= 2 * border:
+    border = (WINDOW_RADIUS_PX + 1) // corners.REDUCTION + 1
+    if min(image.shape) // corners.REDUCTION <= 2 * border:
         return np.zeros((0, 2))
     half = halve(image) if half is None else half
-    pixels, responses = _local_maxima(half, border)
-    best = _best_of_cells(pixels, responses, spacing_px, width=image.shape[1])
+    n_cells = (image.shape[0] // spacing_px + 1) * (image.shape[1] // spacing_px + 1)
+    pixels, scores = np.empty((n_cells, 2)), np.empty(n_cells, np.float32)
+    n = corners.find_corners(np.ascontiguousarray(half), border, spacing_px, pixels, scores)
     chosen = choose_spread(
-        pixels[best],
-        responses[best],
+        pixels[:n],
+        scores[:n],
         width=image.shape[1],
         cell_size_px=CELL_SIZE_PX,
         n_chosen=n_corners,
     )
-    return pixels[best[chosen]].astype(np.float64)
-
-
-def _local_maxima(reduced: ImageArray, border: int) -> tuple[IntArray, NDArray[np.float32]]:
-    """Return pixels of the full image, shape (n, 2), and their scores, shape (n,)."""
-    scores = cv2.cornerMinEigenVal(reduced, _BLOCK_PX)
-    neighbours = cv2.dilate(scores, np.ones((3, 3), dtype=np.uint8))
-    is_corner = (scores == neighbours) & (scores > _MIN_EIGENVALUE)
-    # The indices of a flat array are found several times faster than those of two axes.
-    found = np.flatnonzero(is_corner[border:-border, border:-border])
-    rows, columns = np.divmod(found, reduced.shape[1] - 2 * border)
-    rows, columns = rows + border, columns + border
-    chosen = scores[rows, columns].astype(np.float32)
-    return _REDUCTION * np.column_stack([columns, rows]), chosen
-
-
-def _best_of_cells(
-    pixels: IntArray, responses: NDArray[np.float32], size_px: int, *, width: int
-) -> IntArray:
-    """Return the index of the strongest corner of each cell, sorted; scores are positive."""
-    columns, rows = width // size_px + 1, int(pixels[:, 1].max(initial=0)) // size_px + 1
-    cells = pixels[:, 1] // size_px * columns + pixels[:, 0] // size_px
-    # Positive floats are ordered as their bits are; of equal ones in a cell the last wins.
-    keys = responses.view(np.uint32).astype(np.uint64) << np.uint64(32)
-    best = np.zeros(rows * columns, dtype=np.uint64)
-    np.maximum.at(best, cells, keys | np.arange(len(keys), dtype=np.uint64))
-    return np.sort((best[best > 0] & np.uint64(0xFFFFFFFF)).astype(np.int64))
+    return pixels[chosen]
 
 
 def halve(image: ImageArray) -> ImageArray:

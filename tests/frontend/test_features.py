@@ -5,8 +5,6 @@ from typing import Literal
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from gvo.config import FeaturesConfig
@@ -16,7 +14,6 @@ from gvo.frontend.features import (
     PlaceIndex,
     choose_spread,
     describe_pixels,
-    rank_in_group,
 )
 from gvo.frontend.matching import descriptor_distances
 from gvo.types import ImageArray
@@ -145,13 +142,6 @@ def test_octaves_count_from_the_finest_level(kind: Kind) -> None:
     octaves = extract(blobs(), kind, n_octaves=4, scale_factor=1.3).octaves
     assert octaves.min() >= -1
     assert octaves.max() < 10
-
-
-@given(groups=st.lists(st.integers(0, 5), max_size=30))
-def test_ranks_count_within_each_group(groups: list[int]) -> None:
-    ordered = sorted(groups)
-    expected = [ordered[:i].count(group) for i, group in enumerate(ordered)]
-    assert rank_in_group(np.array(ordered, dtype=np.int64)).tolist() == expected
 
 
 def flipped(descriptors: NDArray[np.uint8], n_bits: int, seed: int) -> NDArray[np.uint8]:
