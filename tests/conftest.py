@@ -14,7 +14,7 @@ import pytest
 from hypothesis import settings
 
 import gvo
-from gvo.kernels.__main__ import compile_all
+from gvo.kernels.jit import machine_code
 
 # How long an example takes says something of the machine, nothing of the code. The examples are the
 # same each time, so that only a change can break a test; HYPOTHESIS_PROFILE=explore draws others,
@@ -31,7 +31,7 @@ _IS_CI = os.environ.get("CI") == "true"
 
 def pytest_sessionstart() -> None:
     """Compile the kernels once, of which a command would tell on standard error."""
-    compile_all()
+    machine_code()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

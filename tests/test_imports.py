@@ -11,8 +11,8 @@ BATCHES = ("dask", "distributed", "pandas", "pyarrow", "fsspec", "cryptography")
 HEAVY = ("matplotlib", "viser", "rerun", "selenium", *BATCHES)
 # The upper triangle of an identity, as pose graphs write it.
 _INFORMATION = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"
-# What compiles the loops of tracking.
-COMPILER = "numba"
+# What loads the compiled loops of tracking, and what compiles them, in a process of its own.
+LOADER, COMPILER = "llvmlite", "numba"
 # Does one thing after the other; tells of each how it ended, and which of the libraries came by it.
 _PROGRAM = """
 import io, json, sys
@@ -106,6 +106,6 @@ def test_tracking_alone_loads_compiled_loops(room_bag: Path, poses: Path, tmp_pa
         command("convert", room_bag, tmp_path / "folder", "--layout", "tum"),
         f"track({str(room_bag)!r})",
     ]
-    found = dict(zip(actions, loaded_by(*actions, names=(COMPILER,)), strict=True))
-    assert found.pop(actions[-1]) == [0, [COMPILER]]
+    found = dict(zip(actions, loaded_by(*actions, names=(LOADER, COMPILER)), strict=True))
+    assert found.pop(actions[-1]) == [0, [LOADER]]
     assert found == {action: [0, []] for action in actions[:-1]}

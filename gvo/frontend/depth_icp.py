@@ -101,15 +101,15 @@ def align_depth_maps(
         Directions of motion that the planes leave open are those of the start value, with a large
         variance.
     """
-    T, H, g = np.array(T_reference_current), np.empty((6, 6)), np.empty(6)
+    T, H, g, squares = np.array(T_reference_current), np.empty((6, 6)), np.empty(6), np.empty(1)
     surfaces = reference.points, reference.normals, current.inverse_depths, current.camera
     for gate, every in _ROUNDS:
-        n, squares = kernels.linearize_planes(T, *surfaces, gate, every, H, g)
+        n = kernels.linearize_planes(T, *surfaces, gate, every, H, g, squares)
         if n * every < _MIN_POINTS:
             return Failure(reason=f"{n} points of two depth images fit each other")
         inverse, open_inverse = _invert(H, reference)
         T = T @ se3.exp(inverse @ g)
-    scale = max(math.sqrt(squares / n), _MIN_SCALE)
+    scale = max(math.sqrt(squares[0] / n), _MIN_SCALE)
     covariance = _N_CORRELATED * scale**2 * (inverse + open_inverse)
     return RelativePose(
         T_reference_current=se3.normalize(T), covariance=0.5 * (covariance + covariance.T)

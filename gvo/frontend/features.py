@@ -95,7 +95,7 @@ class FeatureExtractor:
         found = self._detect(image)
         if self._config.kind in ("fast", "gftt"):
             found = _inside(found, image.shape)
-        found = _spread(found, image.shape, self._config)
+        found = _spread(found, self._config)
         if self._config.upright and self._config.kind != "sift":
             for point in found:
                 point.angle = 0.0
@@ -174,16 +174,13 @@ def _octaves(found: Sequence[cv2.KeyPoint]) -> IntArray:
     return octaves.view(np.int8).astype(np.int64)
 
 
-def _spread(
-    found: Sequence[cv2.KeyPoint], shape: tuple[int, ...], config: FeaturesConfig
-) -> list[cv2.KeyPoint]:
+def _spread(found: Sequence[cv2.KeyPoint], config: FeaturesConfig) -> list[cv2.KeyPoint]:
     """Keep the strongest of each grid cell, round by round, up to the budget."""
     if len(found) == 0:
         return []
     chosen = choose_spread(
         np.asarray(cv2.KeyPoint.convert(found), dtype=np.float64),
         np.array([point.response for point in found]),
-        width=shape[1],
         cell_size_px=config.cell_size_px,
         n_chosen=config.n_features,
     )
@@ -194,7 +191,6 @@ def choose_spread(
     pixels: FloatArray | IntArray,
     responses: NDArray[Any],
     *,
-    width: int,
     cell_size_px: int,
     n_chosen: int,
 ) -> IntArray:
@@ -205,8 +201,6 @@ def choose_spread(
     pixels : ndarray of float64 or int64, shape (n, 2)
     responses : ndarray, shape (n,)
         Strengths.
-    width : int
-        Of the image, pixels.
     cell_size_px : int
         Size of the grid cells.
     n_chosen : int
@@ -217,9 +211,12 @@ def choose_spread(
     ndarray of int64, shape (m,)
         Indices, sorted.
     """
-    order, chosen = np.argsort(-responses, kind="stable"), np.empty(len(pixels), np.int64)
     pixels = np.ascontiguousarray(pixels, dtype=np.float64)
-    n = corners.spread(pixels, order, width, cell_size_px, n_chosen, chosen)
+    last_u, last_v = pixels.max(axis=0, initial=0.0)
+    cells = np.empty((int(last_v // cell_size_px) + 1, int(last_u // cell_size_px) + 1), np.int64)
+    order = np.argsort(-responses, kind="stable")
+    ranks, chosen = np.empty(len(pixels), np.int64), np.empty(len(pixels), np.int64)
+    n = corners.spread(pixels, order, cell_size_px, n_chosen, cells, ranks, chosen)
     return chosen[:n]
 
 

@@ -149,13 +149,16 @@ def detect_corners(
     if min(image.shape) // corners.REDUCTION <= 2 * border:
         return np.zeros((0, 2))
     half = halve(image) if half is None else half
-    n_cells = (image.shape[0] // spacing_px + 1) * (image.shape[1] // spacing_px + 1)
-    pixels, scores = np.empty((n_cells, 2)), np.empty(n_cells, np.float32)
-    n = corners.find_corners(np.ascontiguousarray(half), border, spacing_px, pixels, scores)
+    shape = image.shape[0] // spacing_px + 1, image.shape[1] // spacing_px + 1
+    places, scores = np.empty(shape, np.int64), np.empty(shape, np.float32)
+    rows = np.empty((corners.N_ROWS, half.shape[1]), np.float32)
+    corners.find_corners(np.ascontiguousarray(half), border, spacing_px, rows, places, scores)
+    by_rows = np.argsort(places, axis=None)[np.count_nonzero(places < 0) :]
+    v, u = np.divmod(places.ravel()[by_rows], half.shape[1])
+    pixels = np.stack([u, v], axis=1) * float(corners.REDUCTION)
     chosen = choose_spread(
-        pixels[:n],
-        scores[:n],
-        width=image.shape[1],
+        pixels,
+        scores.ravel()[by_rows],
         cell_size_px=CELL_SIZE_PX,
         n_chosen=n_corners,
     )

@@ -54,7 +54,7 @@ def is_png_complete(data: NDArray[np.uint8]) -> bool:
 
 @contextmanager
 def compiled_png() -> Iterator[None]:
-    """Decode PNG by kernels in this context, where frames are tracked: others load no Numba."""
+    """Decode PNG by kernels in this context, where frames are tracked: others load no kernels."""
     from gvo.kernels.png import unfilter
 
     token = _UNFILTER.set(unfilter)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gvo.kernels.jit import In, Out, helper, kernel
+from gvo.kernels.jit import In, Out, helper, kernel, matrix
 from gvo.kernels.residuals import MIN_DEPTH_M, seen_from
 
 MIN_VARIANCE_RATIO = 1e-6
@@ -42,7 +42,7 @@ def fit_triples(points_a, points_b, T, is_valid):
     JOSAA.4.000629), and the best angle in it is that of a sum of complex numbers. What is no fit,
     of points on a line, of one point or of NaN, has the identity rotation.
     """
-    axes_a, axes_b, turned = np.empty((3, 3)), np.empty((3, 3)), np.empty((2, 3))
+    axes_a, axes_b, turned = matrix(3, 3), matrix(3, 3), matrix(2, 3)
     for k in range(len(points_a)):
         a, p, q = _write_axes(points_a[k], axes_a)
         b, r, s = _write_axes(points_b[k], axes_b)

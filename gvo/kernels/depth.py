@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gvo.kernels.jit import In, Out, kernel
+from gvo.kernels.jit import In, Out, kernel, vector
 from gvo.kernels.linear import clear
 from gvo.kernels.residuals import MIN_DEPTH_M, seen_from
 from gvo.kernels.sampling import value_at
@@ -82,6 +82,7 @@ def sample_depths(image, keypoints, radius, nearest, farthest, max_step, depths,
 @kernel(
     *(In("f8", 2), In("f4", 2), Out("f8", 2), In("f8", 1), "f8", "f8", "f8"),
     Out("f8", 1),
+    returns="i8",
 )
 def compare_depths(points, image, T, camera, nearest, farthest, sigma_px, differences):
     """Write how disparities of the current image differ from those of points of the reference.
@@ -122,7 +123,7 @@ def reduce_depth(image, step, nearest, farthest, inverse):
             inverse[v, u] = mean if is_smooth and is_in_range else np.nan
 
 
-@kernel(In("f4", 2), In("f8", 1), Out("f8", 2), Out("f8", 2))
+@kernel(In("f4", 2), In("f8", 1), Out("f8", 2), Out("f8", 2), returns="i8")
 def fit_surfaces(inverse, camera, points, normals):
     """Write every third point on smooth surfaces, and its unit normal; return their number.
 
@@ -155,9 +156,10 @@ def fit_surfaces(inverse, camera, points, normals):
 
 @kernel(
     *(Out("f8", 2), In("f8", 2), In("f8", 2), In("f4", 2), In("f8", 1), "f8", "i8"),
-    *(Out("f8", 2), Out("f8", 1)),
+    *(Out("f8", 2), Out("f8", 1), Out("f8", 1)),
+    returns="i8",
 )
-def linearize_planes(T, points, normals, inverse, camera, gate, every, H, g):
+def linearize_planes(T, points, normals, inverse, camera, gate, every, H, g, squares):
     """Write the normal equations H step = g of the motion between two depth images.
 
     A point p of the reference, seen at depth z, has the residual r = n . p (z_measured - z) / z
@@ -165,12 +167,14 @@ def linearize_planes(T, points, normals, inverse, camera, gate, every, H, g):
     the plane with the normal n (Chen & Medioni 1992). Its derivatives by the camera's motion
     (rx, ry, rz, tx, ty, tz), right perturbation, are those of n . p: (n x p, -n). Weights are
     those of the Huber kernel. Of every so manieth point that count whose residuals are below the
-    gate; return their number, and the sum of their squared residuals.
+    gate; return their number, and write the sum of their squared residuals (1).
     """
     height, width = inverse.shape
-    J, n, squares = np.empty(6), 0, 0.0
+    J, n = vector(6), 0
     clear(H, g)
-    for k in range(0, len(points), every):
+    squares[0] = 0.0
+    for m in range((len(points) + every - 1) // every):
+        k = m * every
         x, y, z = seen_from(T, points[k])
         if not z > MIN_DEPTH_M:
             continue
@@ -189,7 +193,7 @@ def linearize_planes(T, points, normals, inverse, camera, gate, every, H, g):
         if not (abs(r) < gate and is_near):
             continue
         n += 1
-        squares += r * r
+        squares[0] += r * r
         J[0], J[1], J[2] = b * z - c * y, c * x - a * z, a * y - b * x
         J[3], J[4], J[5] = -a, -b, -c
         weight = min(1.0, _HUBER / max(abs(r), 1e-9)) / sigma
@@ -197,4 +201,4 @@ def linearize_planes(T, points, normals, inverse, camera, gate, every, H, g):
             g[m] += weight * r * J[m]
             for o in range(6):
                 H[m, o] += weight * J[m] * J[o] / sigma
-    return n, squares
+    return n

@@ -1,126 +1,230 @@
-"""How kernels are compiled: once on a machine, and kept in a cache.
+"""Kernels: loops written in Python, compiled once on a machine, kept, and called.
 
 Arithmetic is that of IEEE in the order in which it is written, on one thread: the same bits for
-any number of threads, in each run. A kernel is compiled for the types that are stated, when its
-module is imported. The cache has a folder for each version of this package, of its kernels and
-of Numba, since Numba itself does not notice where a function of another file changed.
+any number of threads, in each run. All kernels are compiled together, by Numba in a process of its
+own (`gvo.kernels.compiler`), for the types that are stated; what is kept is machine code, which
+LLVM loads without Numba. The place where it is kept is named after all that it depends on: the
+version of this package, the sources of its kernels, Numba, and the processor.
+
+With `GVO_KERNELS=python` in the environment kernels are what they look like, and slow.
 """
 
 from __future__ import annotations
 
+import ctypes
 import fcntl
 import hashlib
+import importlib.metadata
 import logging
 import os
+import subprocess
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
-from functools import cache
+from contextlib import contextmanager
+from functools import cache, wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import numba
-from numba import types
+import llvmlite.binding as llvm
+import numpy as np
 
 from gvo._version import __version__
 
 _LOGGER = logging.getLogger(__name__)
-_SOURCES = sorted(Path(__file__).parent.glob("*.py"))
-_DTYPES: dict[str, Any] = {
-    "f4": types.float32,
-    "f8": types.float64,
-    "i8": types.int64,
-    "u1": types.uint8,
-    "u2": types.uint16,
-    "b1": types.boolean,
-}
-# Numba's stubs know neither all options nor what is set by the environment.
-_njit: Any = numba.njit
-_config: Any = numba.config
-_OPTIONS = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
-# Kernels seen so far, and how many of them had to be compiled.
-_COUNTS = {"seen": 0, "compiled": 0}
+_FOLDER = Path(__file__).parent
+_FILE = "kernels.o"
+_N_DIGEST = hashlib.sha256().digest_size
+_SWITCH = "GVO_KERNELS"
+_NUMBERS: dict[str, Any] = {"f8": ctypes.c_double, "i8": ctypes.c_int64, "b1": ctypes.c_bool}
 
 
-def In(dtype: str, ndim: int) -> types.Array:  # noqa: N802 - reads as a type
-    """Return the type of an array, C-contiguous, that is only read, writeable or not."""
-    return types.Array(_DTYPES[dtype], ndim, "C", readonly=True)
+class Array(NamedTuple):
+    """An argument: a C-contiguous array."""
+
+    dtype: np.dtype[Any]
+    ndim: int
+    is_written: bool
+
+    def check(self, given: Any) -> None:
+        """Refuse what compiled code would misread."""
+        flags = given.flags
+        is_fit = flags.carray if self.is_written else flags.c_contiguous and flags.aligned
+        if not is_fit or given.dtype != self.dtype or given.ndim != self.ndim:
+            raise TypeError(
+                f"expected a{' writeable' * self.is_written} C-contiguous array of "
+                f"{self.dtype} with {self.ndim} axes, got {given.dtype} of shape {given.shape}"
+            )
 
 
-def Out(dtype: str, ndim: int) -> types.Array:  # noqa: N802 - reads as a type
-    """Return the type of an array, C-contiguous, that is written."""
-    return types.Array(_DTYPES[dtype], ndim, "C")
+class Signature(NamedTuple):
+    """The types of a kernel: of arguments, arrays or codes of numbers, and of what it returns."""
+
+    arguments: tuple[Array | str, ...]
+    returns: str | None
 
 
-def kernel(*signature: types.Type | str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Compile a function for one signature: `In`, `Out`, or the code of a number ("f8")."""
-    arguments = tuple(_DTYPES[each] if isinstance(each, str) else each for each in signature)
+def In(dtype: str, ndim: int) -> Array:  # noqa: N802 - reads as a type
+    """Return the type of an array that is only read, writeable or not."""
+    return Array(np.dtype(dtype), ndim, is_written=False)
+
+
+def Out(dtype: str, ndim: int) -> Array:  # noqa: N802 - reads as a type
+    """Return the type of an array that is written."""
+    return Array(np.dtype(dtype), ndim, is_written=True)
+
+
+def kernel(
+    *arguments: Array | str, returns: str | None = None
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Compile a function for arguments: `In`, `Out`, or the code of a number ("f8", "i8", "b1").
+
+    It neither raises nor makes arrays, but by `vector` and `matrix`.
+    """
+    signature = Signature(arguments, returns)
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        if _config.DISABLE_JIT:
-            return function
-        with _cached_in(cache_folder()):
-            compiled = _njit(**_OPTIONS, cache=cache_folder() is not None)(function)
-            compiled.compile(arguments)
-        compiled.disable_compile()
-        if cache_folder() is not None:
-            _report(not compiled.stats.cache_hits)
-        return compiled  # type: ignore[no-any-return]
+        made = function if is_interpreted() else _call_of(function, signature)
+        vars(made)["signature"] = signature
+        return made
 
     return decorate
 
 
 def helper(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Make a function that kernels call: compiled with each of them."""
-    return _njit(**_OPTIONS, no_cpython_wrapper=True)(function)  # type: ignore[no-any-return]
+    """Mark a function that kernels call: it is compiled with them."""
+    vars(function)["is_helper"] = True
+    return function
+
+
+def vector(n: int) -> Any:
+    """Return a small array within a kernel, not filled."""
+    return np.empty(n)
+
+
+def matrix(n_rows: int, n_columns: int) -> Any:
+    """Return a small array within a kernel, not filled."""
+    return np.empty((n_rows, n_columns))
+
+
+def is_interpreted() -> bool:
+    """Tell whether kernels are left as they are."""
+    return os.environ.get(_SWITCH) == "python"
+
+
+def symbol_of(function: Callable[..., Any]) -> str:
+    """Return the name of a kernel in the machine code."""
+    return f"{function.__module__}.{function.__name__}"
+
+
+def _call_of(function: Callable[..., Any], signature: Signature) -> Callable[..., Any]:
+    """Return a function of Python that checks arguments, and calls the compiled kernel.
+
+    An array is given as the object it is; the kernel reads where its numbers lie.
+    """
+    types: list[Any] = [
+        _NUMBERS[each] if isinstance(each, str) else ctypes.py_object
+        for each in signature.arguments
+    ]
+    returned = None if signature.returns is None else _NUMBERS[signature.returns]
+    address = machine_code().get_function_address(symbol_of(function))
+    compiled = ctypes.CFUNCTYPE(returned, *types)(address)
+    arrays = [
+        (place, each.check)
+        for place, each in enumerate(signature.arguments)
+        if not isinstance(each, str)
+    ]
+
+    @wraps(function)
+    def call(*arguments: Any) -> Any:
+        if len(arguments) != len(types):
+            raise TypeError(f"{function.__name__} takes {len(types)} arguments")
+        for place, check in arrays:
+            check(arguments[place])
+        return compiled(*arguments)
+
+    return call
 
 
 @cache
-def cache_folder() -> Path | None:
-    """Return where compiled kernels are kept; None where nothing can be written."""
+def machine_code() -> llvm.ExecutionEngine:
+    """Return LLVM with the kernels loaded, compiled first where they are not kept."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    machine = llvm.Target.from_default_triple().create_target_machine()
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
+    engine.add_object_file(llvm.ObjectFileRef.from_data(_kept_or_compiled(cache_folder())))
+    engine.finalize_object()
+    return engine
+
+
+@cache
+def cache_folder() -> Path:
+    """Return where compiled kernels are kept."""
     home = os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()
-    digest = hashlib.sha256(numba.__version__.encode())
-    for path in _SOURCES:
+    processor = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+    versions = (importlib.metadata.version(name) for name in ("numba", "llvmlite", "numpy"))
+    digest = hashlib.sha256("\n".join([*versions, *processor]).encode())
+    for path in sorted(_FOLDER.glob("*.py")):
         digest.update(path.read_bytes())
-    folder = Path(home) / "gvo" / f"kernels-{__version__}-{digest.hexdigest()[:16]}"
+    return Path(home) / "gvo" / f"kernels-{__version__}-{digest.hexdigest()[:16]}"
+
+
+def _kept_or_compiled(folder: Path) -> bytes:
+    """Return machine code; of many processes one compiles, the others wait."""
+    code = _read(folder / _FILE)
+    if code is not None:
+        return code
+    if not _is_writeable(folder):
+        with tempfile.TemporaryDirectory() as other:
+            return _compiled(Path(other) / _FILE, say=_LOGGER.debug)
+    with (folder / "lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        return _read(folder / _FILE) or _compiled(folder / _FILE, say=_LOGGER.warning)
+
+
+def _is_writeable(folder: Path) -> bool:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
-            return folder
+            return True
+    except OSError:
+        return False
+
+
+def _read(path: Path) -> bytes | None:
+    """Return machine code if it is as it was written: what is broken would end the process."""
+    try:
+        data = path.read_bytes()
     except OSError:
         return None
+    digest, code = data[:_N_DIGEST], data[_N_DIGEST:]
+    return code if hashlib.sha256(code).digest() == digest else None
+
+
+def write(path: Path, code: bytes) -> None:
+    """Keep machine code, whole or not at all."""
+    part = path.with_suffix(".part")
+    part.write_bytes(hashlib.sha256(code).digest() + code)
+    part.replace(path)
+
+
+def _compiled(path: Path, say: Callable[..., None]) -> bytes:
+    """Have all kernels compiled into a file, and return what it holds."""
+    command = [sys.executable, "-m", "gvo.kernels.compiler", str(path)]
+    paths = [str(_FOLDER.parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = os.environ | {_SWITCH: "python", "PYTHONPATH": os.pathsep.join(paths)}
+    with _running(command, environment) as lines:
+        for line in lines:
+            say("compiling, once on this machine: %s", line.strip())
+    code = _read(path)
+    if code is None:
+        raise RuntimeError(f"the kernels could not be compiled: {' '.join(command)} tells why")
+    return code
 
 
 @contextmanager
-def _cached_in(folder: Path | None) -> Iterator[None]:
-    """Let Numba keep what it compiles in a folder, one thread at a time: the others wait."""
-    lock = nullcontext() if folder is None else _locked(folder / "lock")
-    with lock:
-        before, _config.CACHE_DIR = _config.CACHE_DIR, "" if folder is None else str(folder)
-        try:
-            yield
-        finally:
-            _config.CACHE_DIR = before
-
-
-@contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    with path.open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
-
-
-@cache
-def n_kernels() -> int:
-    """Return the number of kernels in this package."""
-    return sum(path.read_text("utf-8").count("\n@kernel(") for path in _SOURCES)
-
-
-def _report(is_compiled: bool) -> None:
-    """Say now and then what takes so long."""
-    _COUNTS["seen"] += 1
-    if is_compiled:
-        if _COUNTS["compiled"] % 10 == 0:
-            text = "compiling, once on this machine: %d of %d"
-            _LOGGER.warning(text, _COUNTS["seen"], n_kernels())
-        _COUNTS["compiled"] += 1
+def _running(command: list[str], environment: dict[str, str]) -> Iterator[Any]:
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)  # noqa: S603
+    with process:
+        yield process.stdout

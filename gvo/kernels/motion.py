@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gvo.kernels.jit import helper
+from gvo.kernels.jit import helper, matrix, vector
 
 
 @helper
@@ -25,7 +25,7 @@ def write_rotation(x, y, z, R):
 @helper
 def move_right(T, step):
     """Overwrite T by T @ [R(step[:3]) | step[3:]]: a retraction, to first order the exponential."""
-    S, row = np.empty((3, 3)), np.empty(4)
+    S, row = matrix(3, 3), vector(4)
     write_rotation(step[0], step[1], step[2], S)
     for i in range(3):
         for j in range(3):
@@ -41,7 +41,7 @@ def normalize_rotation(T):
 
     R <- (R + R^-T) / 2 (Higham 1986, doi:10.1137/0907079).
     """
-    C = np.empty((3, 3))
+    C = matrix(3, 3)
     for _ in range(20):
         for i in range(3):
             j, k = (i + 1) % 3, (i + 2) % 3

@@ -22,14 +22,14 @@ def _nearest(left, above, corner):
     return low if limit >= high else corner
 
 
-@kernel(In("u1", 2), "i8", Out("u1", 2))
+@kernel(In("u1", 2), "i8", Out("u1", 2), returns="b1")
 def unfilter(filtered, n_pixel, rows):
     """Write rows of bytes out of filtered ones, each behind its filter; False: there is none such.
 
     The first row is what is above the image, zeros. A byte is what its filter left, plus what that
     predicts from the bytes n_pixel to the left, above, and above to the left, modulo 256.
     """
-    n_bytes = rows.shape[1]
+    n_columns = rows.shape[1] // n_pixel
     for j in range(len(filtered)):
         kind = filtered[j, 0]
         if kind > _PAETH:
@@ -37,22 +37,27 @@ def unfilter(filtered, n_pixel, rows):
         for first in range(n_pixel):
             left, corner = np.int64(0), np.int64(0)
             if kind == _NONE:
-                for i in range(first, n_bytes, n_pixel):
+                for column in range(n_columns):
+                    i = first + column * n_pixel
                     rows[j + 1, i] = filtered[j, i + 1]
             elif kind == _SUB:
-                for i in range(first, n_bytes, n_pixel):
+                for column in range(n_columns):
+                    i = first + column * n_pixel
                     left = (filtered[j, i + 1] + left) & 255
                     rows[j + 1, i] = left
             elif kind == _UP:
-                for i in range(first, n_bytes, n_pixel):
+                for column in range(n_columns):
+                    i = first + column * n_pixel
                     rows[j + 1, i] = (filtered[j, i + 1] + rows[j, i]) & 255
             elif kind == _AVERAGE:
-                for i in range(first, n_bytes, n_pixel):
+                for column in range(n_columns):
+                    i = first + column * n_pixel
                     above = np.int64(rows[j, i])
                     left = (filtered[j, i + 1] + ((left + above) >> 1)) & 255
                     rows[j + 1, i] = left
             else:
-                for i in range(first, n_bytes, n_pixel):
+                for column in range(n_columns):
+                    i = first + column * n_pixel
                     above = np.int64(rows[j, i])
                     left = (filtered[j, i + 1] + _nearest(left, above, corner)) & 255
                     rows[j + 1, i] = left

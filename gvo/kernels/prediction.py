@@ -15,6 +15,7 @@ _MAX_SLOPE = 0.75
 @kernel(
     *(In("f8", 2), In("f8", 2), Out("f8", 2), "f8", In("f8", 2), "f8", In("f8", 1)),
     *(Out("i8", 1), Out("f8", 2), Out("f8", 3), Out("f8", 2)),
+    returns="i8",
 )
 def predict(
     uvd, slopes, T, offset_px, velocities, readout_s, camera, indices, seen, warps, moved_slopes

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gvo.kernels.jit import In, Out, helper, kernel
+from gvo.kernels.jit import In, Out, helper, kernel, matrix, vector
 from gvo.kernels.linear import clear, copy, dot, factorize, invert, solve, substitute
 from gvo.kernels.motion import move_right, normalize_rotation
 from gvo.kernels.residuals import (
@@ -68,7 +68,7 @@ def _linearize(T, point, uvd, factors, camera, huber, J, r):
 @helper
 def _add_up(T, points, uvd, factors, is_used, camera, huber, H, g):
     """Write the normal equations H step = g; False where a point falls behind the camera."""
-    r, J = np.empty(3), np.empty((6, 3))
+    r, J = vector(3), matrix(6, 3)
     clear(H, g)
     for k in range(len(points)):
         if not is_used[k]:
@@ -85,7 +85,7 @@ def _add_up(T, points, uvd, factors, is_used, camera, huber, H, g):
 @helper
 def _descend(T, points, uvd, factors, is_used, camera, huber, n_steps):
     """Move T to the minimum of the robust cost; return how it ended."""
-    H, g, step = np.empty((6, 6)), np.empty(6), np.empty(6)
+    H, g, step = matrix(6, 6), vector(6), vector(6)
     for _ in range(n_steps):
         if not _add_up(T, points, uvd, factors, is_used, camera, huber, H, g):
             return BEHIND
@@ -99,13 +99,13 @@ def _descend(T, points, uvd, factors, is_used, camera, huber, n_steps):
     return DONE
 
 
-@kernel(Out("f8", 2), *_MATCHES, In("f8", 1), "f8", "i8")
+@kernel(Out("f8", 2), *_MATCHES, In("f8", 1), "f8", "i8", returns="i8")
 def descend(T, points, uvd, factors, is_used, camera, huber, n_steps):
     """Move T by a few Gauss-Newton steps; return how it ended."""
     return _descend(T, points, uvd, factors, is_used, camera, huber, n_steps)
 
 
-@kernel(Out("f8", 2), *_MATCHES, In("f8", 1), "f8", "f8")
+@kernel(Out("f8", 2), *_MATCHES, In("f8", 1), "f8", "f8", returns="i8")
 def refine(T, points, uvd, factors, is_used, camera, huber, gate):
     """Move T to the minimum, its inliers chosen anew; return how it ended.
 
@@ -115,15 +115,14 @@ def refine(T, points, uvd, factors, is_used, camera, huber, gate):
     ended = _descend(T, points, uvd, factors, is_used, camera, huber, _N_FIRST_STEPS)
     if ended != DONE:
         return ended
-    is_near, r, n_near, n_used = np.empty(len(points), np.bool_), np.empty(3), 0, 0
+    r, n_near, n_used = vector(3), 0, 0
     for k in range(len(points)):
-        squared = write_residual(T, points[k], uvd[k], factors[k], camera, r)[0]
-        is_near[k] = squared < gate * gate
-        n_near += is_near[k]
+        n_near += write_residual(T, points[k], uvd[k], factors[k], camera, r)[0] < gate * gate
         n_used += is_used[k]
     if n_near >= n_used // 2:
         for k in range(len(points)):
-            is_used[k] = is_near[k]
+            squared = write_residual(T, points[k], uvd[k], factors[k], camera, r)[0]
+            is_used[k] = squared < gate * gate
     ended = _descend(T, points, uvd, factors, is_used, camera, huber, _N_STEPS)
     # Orthonormal to the last digit: many motions are composed with this one.
     normalize_rotation(T)
@@ -142,7 +141,10 @@ def _sandwich(A, S, out):
             out[i, j] = out[j, i] = value
 
 
-@kernel(Out("f8", 2), *_MATCHES, In("f8", 1), "f8", Out("f8", 2), Out("f8", 1))
+@kernel(
+    *(Out("f8", 2), *_MATCHES, In("f8", 1), "f8", Out("f8", 2), Out("f8", 1)),
+    returns="i8",
+)
 def write_covariance(T, points, uvd, factors, is_used, camera, huber, covariance, scale):
     """Write the covariance of a pose (6, 6), and the scale of the noise (1); return how it ended.
 
@@ -150,8 +152,8 @@ def write_covariance(T, points, uvd, factors, is_used, camera, huber, covariance
     covariance of the matches' gradients. Beyond its threshold the Huber cost is linear: residuals
     there have no curvature along their own direction.
     """
-    H, g, inverse = np.empty((6, 6)), np.empty(6), np.empty((6, 6))
-    curvature, sample = np.empty((6, 6)), np.empty((6, 6))
+    H, g, inverse = matrix(6, 6), vector(6), matrix(6, 6)
+    curvature, sample = matrix(6, 6), matrix(6, 6)
     if not _add_up(T, points, uvd, factors, is_used, camera, huber, H, g):
         return BEHIND
     copy(H, curvature)
@@ -162,7 +164,7 @@ def write_covariance(T, points, uvd, factors, is_used, camera, huber, covariance
             return OPEN
     copy(H, curvature)
     clear(sample, g)
-    r, J, score, n, sum_of_squares = np.empty(3), np.empty((6, 3)), np.empty(6), 0, 0.0
+    r, J, score, n, sum_of_squares = vector(3), matrix(6, 3), vector(6), 0, 0.0
     for k in range(len(points)):
         if not is_used[k]:
             continue
@@ -180,7 +182,7 @@ def write_covariance(T, points, uvd, factors, is_used, camera, huber, covariance
                 if is_long:
                     curvature[i, j] -= score[i] * score[j] / squared
     scale[0] = max(np.sqrt(sum_of_squares / max(3 * n - 6, 1)), _MIN_SCALE)
-    sensitivity = np.empty((6, 6))
+    sensitivity = matrix(6, 6)
     is_sane = invert(curvature, sensitivity)
     for i in range(6):
         is_sane = is_sane and sensitivity[i, i] < _MAX_LOSS * inverse[i, i]
@@ -213,11 +215,11 @@ def _write_constants(T, point, sensitivities, k, camera, J, rows):
 def _estimate_one(c, information, scatter, sums, told):
     """Write value and standard deviation of one constant that is free; the others are known."""
     n_constants = len(sums)
-    known, gain = np.empty((n_constants, n_constants)), np.zeros(n_constants)
+    known, gain = matrix(n_constants, n_constants), vector(n_constants)
     copy(information, known)
     for d in range(n_constants):
         known[d, d] += 0.0 if d == c else 1.0
-    gain[c] = 1.0
+        gain[d] = 1.0 if d == c else 0.0
     if not solve(known, gain):
         return
     variance = 0.0
@@ -228,7 +230,10 @@ def _estimate_one(c, information, scatter, sums, told):
     told[0], told[1] = dot(gain, sums), np.sqrt(variance)
 
 
-@kernel(Out("f8", 2), *_MATCHES, In("f8", 4), In("f8", 1), "f8", Out("f8", 2))
+@kernel(
+    *(Out("f8", 2), *_MATCHES, In("f8", 4), In("f8", 1), "f8", Out("f8", 2)),
+    returns="i8",
+)
 def estimate_constants(T, points, uvd, factors, is_used, sensitivities, camera, huber, told):
     """Write the error of each of k constants beside the pose and the others: told (k, 8).
 
@@ -239,27 +244,28 @@ def estimate_constants(T, points, uvd, factors, is_used, sensitivities, camera, 
     """
     n, n_constants = len(points), len(sensitivities)
     size = 6 + n_constants
-    rows, residuals = np.empty((n, size, 3)), np.empty((n, 3))
-    A, alone = np.zeros((size, size)), np.zeros(n_constants)
-    J, now = np.empty((3, 3)), np.empty(3)
+    A, rows, sum_of_rows = matrix(size, size), matrix(size, 3), vector(size)
+    r, J, alone = vector(3), matrix(3, 3), vector(n_constants)
+    clear(A, sum_of_rows)
+    for c in range(n_constants):
+        alone[c] = 0.0
     for k in range(n):
         if not is_used[k]:
             continue
-        r = residuals[k]
-        root = _linearize(T, points[k], uvd[k], factors[k], camera, huber, rows[k], r)
+        root = _linearize(T, points[k], uvd[k], factors[k], camera, huber, rows, r)
         if root == 0.0:
             return BEHIND
-        _write_constants(T, points[k], sensitivities, k, camera, J, rows[k])
+        _write_constants(T, points[k], sensitivities, k, camera, J, rows)
         for c in range(n_constants):
-            whiten(factors[k], root, rows[k, 6 + c])
+            whiten(factors[k], root, rows[6 + c])
             for m in range(3):
-                now[m] = sensitivities[c, 1, k, m]
-            whiten(factors[k], root, now)
-            alone[c] += dot(now, now)
+                r[m] = sensitivities[c, 1, k, m]
+            whiten(factors[k], root, r)
+            alone[c] += dot(r, r)
         for i in range(size):
             for j in range(size):
-                A[i, j] += dot(rows[k, i], rows[k, j])
-    factor, motion = np.empty((6, 6)), np.empty((n_constants, 6))
+                A[i, j] += dot(rows[i], rows[j])
+    factor, motion = matrix(6, 6), matrix(n_constants, 6)
     copy(A, factor)
     for c in range(n_constants):
         for i in range(6):
@@ -269,21 +275,23 @@ def estimate_constants(T, points, uvd, factors, is_used, sensitivities, camera, 
     for c in range(n_constants):
         substitute(factor, motion[c])
     # Schur complement: what no motion explains; and the scores of each match.
-    information, scatter = (
-        np.zeros((n_constants, n_constants)),
-        np.zeros((n_constants, n_constants)),
-    )
-    sums, score = np.zeros(n_constants), np.empty(n_constants)
-    unexplained = np.empty((n_constants, 3))
+    information, sums = matrix(n_constants, n_constants), vector(n_constants)
+    scatter, score = matrix(n_constants, n_constants), vector(n_constants)
+    unexplained = matrix(n_constants, 3)
+    clear(information, sums)
+    clear(scatter, score)
     for k in range(n):
         if not is_used[k]:
             continue
+        root = _linearize(T, points[k], uvd[k], factors[k], camera, huber, rows, r)
+        _write_constants(T, points[k], sensitivities, k, camera, J, rows)
         for c in range(n_constants):
+            whiten(factors[k], root, rows[6 + c])
             for m in range(3):
-                unexplained[c, m] = rows[k, 6 + c, m]
+                unexplained[c, m] = rows[6 + c, m]
                 for i in range(6):
-                    unexplained[c, m] -= motion[c, i] * rows[k, i, m]
-            score[c] = dot(unexplained[c], residuals[k])
+                    unexplained[c, m] -= motion[c, i] * rows[i, m]
+            score[c] = dot(unexplained[c], r)
             sums[c] += score[c]
         for c in range(n_constants):
             for d in range(n_constants):
@@ -301,6 +309,7 @@ def estimate_constants(T, points, uvd, factors, is_used, sensitivities, camera, 
 @kernel(
     *(Out("f8", 2), *_MATCHES, In("f8", 4), In("f8", 1), "f8", "f8", "i8"),
     *(Out("f8", 1), Out("f8", 2), Out("f8", 2)),
+    returns="i8",
 )
 def adjust(
     T,
@@ -324,26 +333,27 @@ def adjust(
     """
     n, n_constants = len(points), len(sensitivities)
     size = 6 + n_constants
-    constants = np.empty((n, size, 3))
-    J, rows, r, measured = np.empty((3, 3)), np.empty((size, 3)), np.empty(3), np.empty(3)
-    for k in range(n):
-        _write_constants(T, points[k], sensitivities, k, camera, J, constants[k])
-    H, g, factor = np.empty((size, size)), np.empty(size), np.empty((size, size))
+    # By the motion from which it begins the constants move residuals.
+    start, constants = matrix(4, 4), matrix(size, 3)
+    copy(T, start)
+    J, rows, r, measured = matrix(3, 3), matrix(size, 3), vector(3), vector(3)
+    H, g, factor = matrix(size, size), vector(size), matrix(size, size)
     for _ in range(n_steps):
         clear(H, g)
         for k in range(n):
             if not is_used[k]:
                 continue
+            _write_constants(start, points[k], sensitivities, k, camera, J, constants)
             for m in range(3):
                 measured[m] = uvd[k, m]
                 for c in range(n_constants):
-                    measured[m] -= values[c] * constants[k, 6 + c, m]
+                    measured[m] -= values[c] * constants[6 + c, m]
             root = _linearize(T, points[k], measured, factors[k], camera, huber, rows, r)
             if root == 0.0:
                 return BEHIND
             for c in range(n_constants):
                 for m in range(3):
-                    rows[6 + c, m] = constants[k, 6 + c, m]
+                    rows[6 + c, m] = constants[6 + c, m]
                 whiten(factors[k], root, rows[6 + c])
             for i in range(size):
                 g[i] += dot(rows[i], r)
@@ -359,7 +369,7 @@ def adjust(
         for c in range(n_constants):
             values[c] += g[6 + c]
     normalize_rotation(T)
-    inverse, of_pose = np.empty((size, size)), np.empty((6, 6))
+    inverse, of_pose = matrix(size, size), matrix(6, 6)
     copy(H, factor)
     copy(H, of_pose)
     if not invert(factor, inverse) or not factorize(of_pose):

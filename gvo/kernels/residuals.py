@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gvo.kernels.jit import In, Out, helper, kernel
+from gvo.kernels.jit import In, Out, helper, kernel, matrix, vector
 
 MIN_DEPTH_M = 1e-3
 # Nearer points, and points behind the camera, are no inliers: their noise is not propagated.
@@ -108,7 +108,7 @@ def write_factors(T, points, reference_sigmas, current_sigmas, camera, factors):
     are the variances of (u, v, disparity) in the reference and in the current frame, and J is the
     derivative of one by the other at T. The squared pivots of C are no less than D.
     """
-    J, C = np.empty((3, 3)), np.empty((3, 3))
+    J, C = matrix(3, 3), matrix(3, 3)
     for k in range(len(points)):
         write_reference_jacobian(T, points[k], camera, J)
         for i in range(3):
@@ -135,6 +135,6 @@ def write_factors(T, points, reference_sigmas, current_sigmas, camera, factors):
 @kernel(Out("f8", 2), In("f8", 2), In("f8", 2), In("f8", 2), In("f8", 1), Out("f8", 1))
 def square_residuals(T, points, uvd, factors, camera, squared):
     """Write the squared lengths of whitened residuals; infinite behind the camera."""
-    r = np.empty(3)
+    r = vector(3)
     for k in range(len(points)):
         squared[k] = write_residual(T, points[k], uvd[k], factors[k], camera, r)[0]

@@ -8,9 +8,7 @@ pose; a camera is an array (fx, fy, cx, cy, baseline, width, height).
 
 from __future__ import annotations
 
-import numpy as np
-
-from gvo.kernels.jit import In, Out, helper, kernel
+from gvo.kernels.jit import In, Out, helper, kernel, matrix
 from gvo.kernels.residuals import write_pose_jacobian
 
 # Moved to the middle of the exposure, points must stay in front of the camera.
@@ -81,7 +79,7 @@ def write_readout_rates(uvd, offset_px, velocity, camera, rates):
 @kernel(In("f8", 2), In("f8", 2), In("f8", 1), "f8", In("f8", 1), Out("f8", 3))
 def write_velocity_errors(points, uvd, sigmas, readout_s, camera, errors):
     """Write by how much settled (u, v, disparity) err by a sigma of each axis: errors (6, n, 3)."""
-    J = np.empty((6, 3))
+    J = matrix(6, 3)
     for k in range(len(points)):
         write_pose_jacobian(points[k, 0], points[k, 1], points[k, 2], camera, J)
         dt = readout_s * row_time(uvd[k, 1], camera)

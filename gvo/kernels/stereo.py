@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gvo.kernels.jit import In, Out, helper, kernel
+from gvo.kernels.jit import In, Out, helper, kernel, matrix, vector
 from gvo.kernels.linear import factorize, substitute
 from gvo.kernels.sampling import sample
 
@@ -51,7 +51,7 @@ _MAX_SLOPE = 0.5
 _MIN_WIDTH = 0.5
 # Variance of grey values over that of a disparity, its slopes and a difference of sharpness: the
 # prior of a patch that faces the camera and is as sharp on the right.
-_PRIORS = (1.0, 100.0, 100.0, 1000.0)
+_PRIORS = np.array([1.0, 100.0, 100.0, 1000.0])
 # Largest variance of the difference of matching patches: a share of the patch's variance, plus the
 # noise of the pixels, grey values squared.
 _MAX_UNLIKE = 0.2
@@ -93,7 +93,7 @@ def _correlate(left, right, column, row, n_steps, scores):
     where the place is left of the right image.
     """
     height, width = left.shape
-    patch, n_pixels, mean = np.empty((_COARSE_SIDE, _COARSE_SIDE)), _COARSE_SIDE**2, 0.0
+    patch, n_pixels, mean = matrix(_COARSE_SIDE, _COARSE_SIDE), _COARSE_SIDE**2, 0.0
     for j in range(_COARSE_SIDE):
         y = min(max(row + j - _COARSE_RADIUS_PX, 0), height - 1)
         for i in range(_COARSE_SIDE):
@@ -136,7 +136,7 @@ def search(left, right, pixels, max_disparity, disparities, is_found, rivals):
     """
     height, width = left.shape
     n_steps = min(int(np.ceil(max_disparity / REDUCTION)), width)
-    n, scores = n_steps + 1, np.empty(n_steps + 1)
+    n, scores = n_steps + 1, vector(n_steps + 1)
     for k in range(len(pixels)):
         column = min(int(pixels[k, 0] // REDUCTION), width - 1)
         row = min(int(pixels[k, 1] // REDUCTION), height - 1)
@@ -256,7 +256,7 @@ def _fit_plane(wide, patch, right, u, row, basis, H, seen, plane):
     the patch seen before the last step. Return whether the surface is not too steep to be seen by
     both cameras, nor too far from where one that faces them would be.
     """
-    stride, m, pull, start = _SIDE + 2, 0, np.empty(4), plane[0]
+    stride, m, pull, start = _SIDE + 2, 0, vector(4), plane[0]
     for j in range(-RADIUS_PX, RADIUS_PX + 1):
         for i in range(-RADIUS_PX, RADIUS_PX + 1):
             k = (j + RADIUS_PX + 1) * stride + i + RADIUS_PX + 1
@@ -338,10 +338,12 @@ def measure(
     where two disparities match as well, either may be wrong. What is reliable is measured again
     together with the slopes of its surface. Unless refined, disparities are whole pixels.
     """
-    wide, strip = np.empty((_SIDE + 2) ** 2), np.empty(_SIDE * _STRIP)
-    patch, weights, seen = np.empty(_N_PIXELS), np.empty(_N_PIXELS), np.empty(_N_PIXELS)
-    basis, H, plane = np.empty((4, _N_PIXELS)), np.empty((4, 4)), np.empty(3)
-    differences, nothing = np.empty(_N_PLACES), np.zeros(_N_PIXELS)
+    wide, strip = vector((_SIDE + 2) ** 2), vector(_SIDE * _STRIP)
+    patch, weights, seen = vector(_N_PIXELS), vector(_N_PIXELS), vector(_N_PIXELS)
+    basis, H, plane = matrix(4, _N_PIXELS), matrix(4, 4), vector(3)
+    differences, nothing = vector(_N_PLACES), vector(_N_PIXELS)
+    for m in range(_N_PIXELS):
+        nothing[m] = 0.0
     for k in range(len(corners)):
         disparities[k], row_shifts[k], is_reliable[k] = np.nan, np.nan, False
         slopes[k, 0], slopes[k, 1] = 0.0, 0.0
@@ -402,8 +404,8 @@ def follow(left, right, pixels, predicted, slopes, row_offset_px, n_steps, dispa
     By Gauss-Newton steps; patches of the right image are sampled as those of surfaces of these
     slopes (n, 2). Write NaN without room, and which come to rest within reach.
     """
-    wide, strip = np.empty((_SIDE + 2) ** 2), np.empty(_SIDE * _STRIP)
-    patch, weights, reach = np.empty(_N_PIXELS), np.empty(_N_PIXELS), RADIUS_PX + _MARGIN_PX
+    wide, strip = vector((_SIDE + 2) ** 2), vector(_SIDE * _STRIP)
+    patch, weights, reach = vector(_N_PIXELS), vector(_N_PIXELS), RADIUS_PX + _MARGIN_PX
     for k in range(len(pixels)):
         disparities[k], is_valid[k] = np.nan, False
         u, v, start = pixels[k, 0], pixels[k, 1], predicted[k]
@@ -433,9 +435,9 @@ def search_near(left, right, pixels, predicted, row_offset_px, is_refined, dispa
     steps, which remove the bias of the parabola towards the weaker texture. Write NaN without room,
     and which are no end of the search. Unless refined, disparities are whole pixels.
     """
-    wide, strip = np.empty((_SIDE + 2) ** 2), np.empty(_SIDE * _STRIP)
-    patch, weights, reach = np.empty(_N_PIXELS), np.empty(_N_PIXELS), RADIUS_PX + _MARGIN_PX
-    differences = np.empty(_N_PLACES)
+    wide, strip = vector((_SIDE + 2) ** 2), vector(_SIDE * _STRIP)
+    patch, weights, reach = vector(_N_PIXELS), vector(_N_PIXELS), RADIUS_PX + _MARGIN_PX
+    differences = vector(_N_PLACES)
     for k in range(len(pixels)):
         disparities[k], is_valid[k] = np.nan, False
         u, v, start = pixels[k, 0], pixels[k, 1], predicted[k]

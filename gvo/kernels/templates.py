@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gvo.kernels.jit import In, Out, kernel
+from gvo.kernels.jit import In, Out, kernel, vector
 from gvo.kernels.sampling import sample
 
 RADIUS_PX = 4
@@ -79,7 +79,7 @@ def align(image, values, gradients, inverses, indices, warps, pixels, is_found):
     |j| <= radius, and the patch. Write which are found: not what does not come to rest, or is
     unlike its patch, by the variance of d without (G d)' H^-1 G d, which the step explains.
     """
-    seen = np.empty(_N_PIXELS)
+    seen = vector(_N_PIXELS)
     for k in range(len(indices)):
         p, warp = indices[k], warps[k]
         u, v, moved, unlike = pixels[k, 0], pixels[k, 1], np.inf, np.inf

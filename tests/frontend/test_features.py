@@ -96,9 +96,9 @@ def test_a_crowded_corner_does_not_take_the_whole_budget() -> None:
 def test_cells_of_a_very_wide_image_are_told_apart() -> None:
     # A million cells: these two would share their number, counted in sixteen bits.
     pixels = np.array([[4, 4], [4, 8 * 128 + 4]])
-    chosen = choose_spread(pixels, np.array([2.0, 1.0]), width=4096, cell_size_px=8, n_chosen=2)
+    chosen = choose_spread(pixels, np.array([2.0, 1.0]), cell_size_px=8, n_chosen=2)
     weak = np.vstack([pixels[:1] + 1, pixels])
-    alone = choose_spread(weak, np.array([1.5, 2.0, 1.0]), width=4096, cell_size_px=8, n_chosen=2)
+    alone = choose_spread(weak, np.array([1.5, 2.0, 1.0]), cell_size_px=8, n_chosen=2)
     assert (chosen.tolist(), alone.tolist()) == ([0, 1], [1, 2])
 
 

@@ -229,6 +229,6 @@ def test_images_are_read_without_kernels_where_nothing_is_tracked(tmp_path: Path
     program = f"""
 import pathlib, sys
 from gvo.io.images import read_image
-print(read_image(pathlib.Path({str(path)!r})).shape, "numba" in sys.modules)
+print(read_image(pathlib.Path({str(path)!r})).shape, "llvmlite" in sys.modules)
 """
     assert python("-c", program).stdout == "(6, 8) False\n"

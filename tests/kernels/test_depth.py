@@ -195,8 +195,8 @@ def test_normal_equations_are_those_of_distances_to_planes(every: int, gate: flo
     image, T = scene(3, unknown=0.02), motion((0.01, -0.015, 0.02, 0.01, 0.02, -0.015))
     points, normals = surfaces((1.0 / scene(4, unknown=0.02)).astype(np.float32))
     inverse = (1.0 / image).astype(np.float32)
-    H, g = np.full((6, 6), 7.0), np.full(6, 7.0)
-    n, squares = kernels.linearize_planes(T, points, normals, inverse, CAMERA, gate, every, H, g)
+    H, g, squares = np.full((6, 6), 7.0), np.full(6, 7.0), np.full(1, 7.0)
+    n = kernels.linearize_planes(T, points, normals, inverse, CAMERA, gate, every, H, g, squares)
     expected_H, expected_g, rows = np.zeros((6, 6)), np.zeros(6), []
     for point, normal in zip(points[::every], normals[::every], strict=True):
         x, y, z = moved(point[np.newaxis], T)[0]
@@ -224,7 +224,7 @@ def test_normal_equations_are_those_of_distances_to_planes(every: int, gate: flo
         expected_g += weight * r * J
         rows.append(r)
     assert n == len(rows) > 50 / every
-    assert squares == pytest.approx(np.sum(np.square(rows)), rel=1e-9)
+    assert squares[0] == pytest.approx(np.sum(np.square(rows)), rel=1e-9)
     np.testing.assert_allclose(H, expected_H, rtol=1e-6, atol=1e-7 * np.abs(expected_H).max())
     np.testing.assert_allclose(g, expected_g, rtol=1e-6, atol=1e-7 * np.abs(expected_g).max())
 
@@ -235,7 +235,8 @@ def test_a_step_of_the_normal_equations_leads_to_where_the_camera_is() -> None:
     points, normals = surfaces(inverse)
     start = motion((0.002, -0.001, 0.003, 0.004, -0.002, 0.003))
     H, g = np.empty((6, 6)), np.empty(6)
-    kernels.linearize_planes(start, points, normals, inverse, CAMERA, np.inf, 1, H, g)
+    surface = points, normals, inverse, CAMERA
+    kernels.linearize_planes(start, *surface, np.inf, 1, H, g, np.empty(1))
     left = start @ motion(tuple(np.linalg.solve(H, g)))
     np.testing.assert_allclose(left, np.eye(4), atol=0.2 * np.abs(start - np.eye(4)).max())
 
@@ -243,14 +244,15 @@ def test_a_step_of_the_normal_equations_leads_to_where_the_camera_is() -> None:
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1.0, 0.0])
 def test_points_that_are_seen_nowhere_tell_nothing(value: float) -> None:
     inverse = np.full((30, 40), 0.5, np.float32)
-    normals, H, g = np.tile([0.0, 0.0, 1.0], (3, 1)), np.full((6, 6), 7.0), np.full(6, 7.0)
+    normals, squares = np.tile([0.0, 0.0, 1.0], (3, 1)), np.full(1, 7.0)
+    H, g = np.full((6, 6), 7.0), np.full(6, 7.0)
     points = np.array([[0.0, 0.0, value], [value, 0.0, value], [0.0, 0.0, -value]])
     for given in (points, points[:0]):
         arguments = given, normals, inverse, CAMERA, np.inf, 1
-        assert kernels.linearize_planes(np.eye(4), *arguments, H, g) == (0, 0.0)
+        assert kernels.linearize_planes(np.eye(4), *arguments, H, g, squares) == squares[0] == 0.0
         np.testing.assert_array_equal(H, np.zeros((6, 6)))
         np.testing.assert_array_equal(g, np.zeros(6))
     unknown = np.full((30, 40), np.nan, np.float32)
     seen = np.array([[0.0, 0.0, 2.0]] * 3)
     arguments = seen, normals, unknown, CAMERA, np.inf, 1
-    assert kernels.linearize_planes(np.eye(4), *arguments, H, g) == (0, 0.0)
+    assert kernels.linearize_planes(np.eye(4), *arguments, H, g, squares) == squares[0] == 0.0

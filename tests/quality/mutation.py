@@ -39,7 +39,7 @@ TESTS += ["tests/io/test_sync.py", "tests/io/test_sync_reference.py"]
 MIN_KILLED, UNUSABLE = 0.9, 3
 SPARE_S, PATIENCE = 5.0, 10.0
 # What is tested in processes of its own, where no mutant is.
-NOT_CHANGED = {ROOT / "gvo/kernels/jit.py"}
+NOT_CHANGED = {ROOT / "gvo/kernels/jit.py", ROOT / "gvo/kernels/compiler.py"}
 # Compiled kernels do not warn of what is divided by zero.
 WARNINGS = "filterwarnings=error\nignore::RuntimeWarning:gvo.kernels"
 
@@ -337,7 +337,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=2)
     arguments = parser.parse_args()
     os.chdir(ROOT)
-    os.environ["NUMBA_DISABLE_JIT"] = "1"
+    os.environ["GVO_KERNELS"] = "python"
     cv2.setNumThreads(1)  # a fork has no threads, and would wait for them
     given = [Path(path).resolve() for path in arguments.paths]
     files = [file for path in given for file in (sorted(path.rglob("*.py")) or [path])]
