@@ -7,9 +7,10 @@ frames and finding 2000 ORB features in 8 octaves on their images (of RGB-D the 
 time on one thread. Run and yardstick take turns for some rounds, and medians are printed. Starting
 up and drawing are left out.
 
-`--against CHECKOUT` compares with another version instead: `gvo run` of both, as whole processes in
-turns, and their medians. Times depend on the machine and on what else it does, ratios less so.
-`--demo` measures `gvo demo`, as a whole process in either case.
+`--against CHECKOUT` compares with another version instead: `gvo run` of both in turns, as whole
+processes without the report. In each round that of a moment is run too: what it takes is starting
+up, the rest is that of the frames. Medians are printed; times depend on the machine and on what
+else it does, ratios less so. `--demo` measures `gvo demo`, as a whole process in either case.
 
 Example: python scripts/benchmark.py cost kitti_06_start
 Example: python scripts/benchmark.py cost kitti_06_start --demo --against ../before --rounds 5
@@ -65,11 +66,11 @@ COSTS_HEADER = (
     "peak [MB]",
     "growth [MB]",
 )
-PROCESS_HEADER = ("command", "CPU [s]", "wall [s]", "peak [MB]")
-AGAINST_HEADER = (
-    "command",
-    *(f"{figure} {what}" for figure in PROCESS_HEADER[1:] for what in ("here", "there", "ratio")),
-)
+PROCESS_FIGURES = {"CPU [s]": 2, "wall [s]": 2, "peak [MB]": 0}
+"""What is printed of a process, and with how many decimals."""
+FRAME_FIGURES = {"CPU/frame [ms]": 2, "wall/frame [ms]": 2, "start CPU [s]": 2, "peak [MB]": 0}
+# Of a recording, to measure starting up: a few frames.
+MOMENT_S = 0.3
 
 
 class Round(NamedTuple):
@@ -80,6 +81,15 @@ class Round(NamedTuple):
     yardstick_ms: float
     peak_mb: float
     growth_mb: float
+
+
+class ProcessCost(NamedTuple):
+    """What a command cost, and of how many frames it wrote poses."""
+
+    cpu_s: float
+    wall_s: float
+    peak_mb: float
+    n_frames: int
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -104,31 +114,60 @@ def measure(arguments: argparse.Namespace) -> None:
     if arguments.against is not None:
         settings = [word for each in arguments.set for word in ("--set", each)]
         named = {
-            each.name: ["run", str(each.resolve()), *settings] for each in arguments.recordings
+            each.name: ["run", str(each.resolve()), "--no-report", *settings]
+            for each in arguments.recordings
         }
-        commands = named | commands
+        compare(named, checkouts, arguments.rounds, frame_costs, FRAME_FIGURES)
     else:
         measure_recordings(arguments.recordings, arguments.set, arguments.rounds)
-    if commands:
-        compare(commands, checkouts, arguments.rounds)
+    compare(commands, checkouts, arguments.rounds, process_costs, PROCESS_FIGURES)
 
 
-def compare(commands: dict[str, list[str]], checkouts: Sequence[Path], n_rounds: int) -> None:
-    """Print what commands cost as whole processes, by one checkout or by two in turns."""
-    table = Table(AGAINST_HEADER if len(checkouts) > 1 else PROCESS_HEADER, commands)
+def compare(
+    commands: dict[str, list[str]],
+    checkouts: Sequence[Path],
+    n_rounds: int,
+    costs: Callable[[Sequence[str], Path], tuple[float, ...]],
+    figures: dict[str, int],
+) -> None:
+    """Print what commands cost as processes, by one checkout or by two in turns."""
+    if not commands:
+        return
+    kinds = ("here", "there", "ratio") if len(checkouts) > 1 else ("",)
+    table = Table(
+        ["command", *(f"{name} {kind}".strip() for name in figures for kind in kinds)], commands
+    )
     for name, words in commands.items():
-        rounds = [[process_cost(words, each) for each in checkouts] for _ in range(n_rounds + 1)]
+        rounds = [[costs(words, each) for each in checkouts] for _ in range(n_rounds + 1)]
         medians = np.median(rounds[1:], axis=0)  # the first one compiles, and fills caches
         cells = []
-        for figures, n_decimals in zip(medians.T, (2, 2, 0), strict=True):
-            cells += [f"{figure:.{n_decimals}f}" for figure in figures]
+        for measured, n_decimals in zip(medians.T, figures.values(), strict=True):
+            cells += [f"{figure:.{n_decimals}f}" for figure in measured]
             if len(checkouts) > 1:
-                cells.append(f"{figures[0] / figures[1]:.3f}")
+                cells.append(f"{measured[0] / measured[1]:.3f}")
         table.add([name, *cells])
 
 
-def process_cost(words: Sequence[str], checkout: Path) -> tuple[float, float, float]:
+def frame_costs(words: Sequence[str], checkout: Path) -> tuple[float, float, float, float]:
+    """Return CPU and elapsed ms per frame of a run, CPU seconds to start, and the peak in MB."""
+    whole = process_cost(words, checkout)
+    moment = process_cost([*words, "--duration", str(MOMENT_S)], checkout)
+    n_frames = whole.n_frames - moment.n_frames
+    if n_frames < 1:
+        raise gvo.GvoError(f"{words[1]}: expected more than {MOMENT_S} s")
+    cpu_s, wall_s = whole.cpu_s - moment.cpu_s, whole.wall_s - moment.wall_s
+    start_s = moment.cpu_s - moment.n_frames * cpu_s / n_frames
+    return 1e3 * cpu_s / n_frames, 1e3 * wall_s / n_frames, start_s, whole.peak_mb
+
+
+def process_costs(words: Sequence[str], checkout: Path) -> tuple[float, float, float]:
     """Return CPU seconds, elapsed seconds and the peak in MB of a gvo command of a checkout."""
+    cost = process_cost(words, checkout)
+    return cost.cpu_s, cost.wall_s, cost.peak_mb
+
+
+def process_cost(words: Sequence[str], checkout: Path) -> ProcessCost:
+    """Run a gvo command of a checkout."""
     with tempfile.TemporaryDirectory() as folder:
         answer = subprocess.run(
             [sys.executable, "-c", LAUNCHER, *GVO, *words, "--out", f"{folder}/out"],
@@ -138,12 +177,14 @@ def process_cost(words: Sequence[str], checkout: Path) -> tuple[float, float, fl
             env=os.environ | {"PYTHONPATH": str(checkout)},
             cwd=folder,
         )
+        frames = Path(folder, "out", "frames.csv")
+        n_frames = frames.read_text("utf-8").count("\n") - 1 if frames.is_file() else 0
     code, cpu_s, wall_s, peak = map(float, answer.stdout.split())
     if code not in (0, 3):  # 3: some frames are missing
         last = answer.stderr.strip().rpartition("\n")[2]
         raise gvo.GvoError(f"gvo {' '.join(words)} of {checkout} failed: {last}")
     unit = 2**20 if sys.platform == "darwin" else 2**10  # bytes there, else kB
-    return cpu_s, wall_s, peak / unit
+    return ProcessCost(cpu_s=cpu_s, wall_s=wall_s, peak_mb=peak / unit, n_frames=n_frames)
 
 
 def measure_recordings(paths: Sequence[Path], settings: Sequence[str], n_rounds: int) -> None:
