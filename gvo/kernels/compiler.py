@@ -28,6 +28,7 @@ from numba.np import arrayobj
 from gvo import kernels
 from gvo.kernels import jit
 
+os.environ[jit.SWITCH] = "python"  # what is imported from here on is not compiled yet
 _EVERY = 10
 _OWN = {f"{kernels.__name__}.{name}" for name in ("__main__", "compiler", "jit")}
 _TYPES: dict[str | None, Any] = {

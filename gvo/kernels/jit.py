@@ -30,12 +30,14 @@ import llvmlite.binding as llvm
 import numpy as np
 
 from gvo._version import __version__
+from gvo.errors import GvoError
 
 _LOGGER = logging.getLogger(__name__)
 _FOLDER = Path(__file__).parent
 _FILE = "kernels.o"
 _N_DIGEST = hashlib.sha256().digest_size
-_SWITCH = "GVO_KERNELS"
+SWITCH = "GVO_KERNELS"
+"""Of the environment: `python` leaves kernels as they are."""
 _NUMBERS: dict[str, Any] = {"f8": ctypes.c_double, "i8": ctypes.c_int64, "b1": ctypes.c_bool}
 
 
@@ -109,7 +111,7 @@ def matrix(n_rows: int, n_columns: int) -> Any:
 
 def is_interpreted() -> bool:
     """Tell whether kernels are left as they are."""
-    return os.environ.get(_SWITCH) == "python"
+    return os.environ.get(SWITCH) == "python"
 
 
 def symbol_of(function: Callable[..., Any]) -> str:
@@ -213,13 +215,13 @@ def _compiled(path: Path, say: Callable[..., None]) -> bytes:
     """Have all kernels compiled into a file, and return what it holds."""
     command = [sys.executable, "-m", "gvo.kernels.compiler", str(path)]
     paths = [str(_FOLDER.parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = os.environ | {_SWITCH: "python", "PYTHONPATH": os.pathsep.join(paths)}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
     with _running(command, environment) as lines:
         for line in lines:
             say("compiling, once on this machine: %s", line.strip())
     code = _read(path)
     if code is None:
-        raise RuntimeError(f"the kernels could not be compiled: {' '.join(command)} tells why")
+        raise GvoError(f"the kernels could not be compiled: {' '.join(command)} tells why")
     return code
 
 

@@ -1,6 +1,7 @@
 """How kernels are compiled and kept, on a small package of two of them, in processes."""
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -56,6 +57,8 @@ def package(tmp_path: Path) -> Path:
     (tmp_path / "gvo/__init__.py").touch()
     (tmp_path / "gvo/_version.py").write_text('__version__ = "1.2"\n')
     source = Path(gvo.kernels.__file__).parent
+    for name in ("errors.py", "_text.py"):
+        shutil.copy(source.with_name(name), tmp_path / "gvo")
     texts = {name: (source / f"{name}.py").read_text("utf-8") for name in ("jit", "compiler")}
     for name, text in (texts | {"__init__": "", "helpers": _HELPERS, "loops": _LOOPS}).items():
         (kernels / f"{name}.py").write_text(text)
