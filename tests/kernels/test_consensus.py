@@ -28,6 +28,7 @@ def test_triples_are_fitted_as_by_singular_values(n: int) -> None:
     a += rng.choice([0.0, 0.1, 3.0], (n, 1, 1)) * rng.normal(size=(n, 3, 3))
     b[10:12, 2] = 2.0 * b[10:12, 1] - b[10:12, 0]  # on a line
     a[12:13], a[13:14, 1, 2] = a[12:13, :1], np.nan
+    a[14:15], b[14:15] = 1e-8 * a[14:15], 1e-8 * b[14:15]
     T, is_valid = np.full((n, 4, 4), 7.0), np.ones(n, np.bool_)
     fit_triples(a, b, T, is_valid)
     expected = np.reshape([fit_plainly(*each) for each in zip(a, b, strict=True)], (n, 4, 4))

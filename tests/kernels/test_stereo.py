@@ -1,7 +1,5 @@
 """Disparities against the formulas of their docstrings, corner by corner."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -12,8 +10,7 @@ from tests.kernels.images import around, shifted, slopes_along, texture
 R = kernels.RADIUS_PX
 SIDE, MARGIN, N_PLACES = 2 * R + 1, 4, 9
 WARP = np.array([[0.93, 0.06], [0.0, 1.0]])
-"""Of the right image: that of a surface with these slopes."""
-SLOPES = np.array([1.0, 0.0]) - WARP[0]
+"""Of the right image: that of a slanted surface."""
 
 
 def peak(values: FloatArray) -> float:
@@ -25,21 +22,34 @@ def peak(values: FloatArray) -> float:
     return float(best - b / (2.0 * a))
 
 
-def pair(rng: np.random.Generator) -> tuple[ImageArray, ImageArray]:
-    """Return images of a slanted surface, the upper half of a wall whose windows are all alike."""
-    left = texture(rng, (64, 128))
-    left[:26] = np.tile(left[:26, :26], 5)[:, :128]
-    right = shifted(rng, left, WARP, (-14.0, 0.3))
-    right[:, 84:] = texture(rng, (64, 44))
+def pair(
+    rng: np.random.Generator, warp: FloatArray = WARP, *, blur: float = 1.5
+) -> tuple[ImageArray, ImageArray]:
+    """Return images of a plane.
+
+    Windows more or less alike, from above; bars that are alike from five and six pixels to the
+    next; faint texture; clear one.
+    """
+    left = texture(rng, (84, 128), blur=blur)
+    unlike = np.linspace(0, 0.5, 128) * (texture(rng, (26, 128), blur=blur) - 120.0)
+    left[:26] = np.clip(np.tile(left[:26, :26], 5)[:, :128] + unlike, 0, 255)
+    for first, period in ((0, 5), (60, 6)):
+        bar = left[26:46, first : first + period]
+        left[26:46, first : first + 60] = np.tile(bar, 12)[:, :60]
+    left[46:62] = 100 + left[46:62] // 20
+    right = shifted(rng, left, warp, (-14.0, 0.3))
+    right[:, 84:] = texture(rng, (84, 44))
     return left, right
 
 
-def corners_of(rng: np.random.Generator, n: int) -> tuple[FloatArray, FloatArray]:
+def corners_of(
+    rng: np.random.Generator, n: int, warp: FloatArray = WARP
+) -> tuple[FloatArray, FloatArray]:
     """Return pixels, some of them near or beyond the border, and their disparities."""
-    corners = np.rint(rng.uniform([14, 4], [118, 60], (n, 2)))
-    ends = np.reshape([24.0, 5, 24, 4, 122, 58, 122, 59, 123, 50, np.nan, 30], (6, 2))
+    corners = np.rint(rng.uniform([14, 4], [118, 80], (n, 2)))
+    ends = np.reshape([24.0, 5, 24, 4, 122, 78, 122, 79, 123, 50, np.nan, 30], (6, 2))
     corners[:6] = ends[:n]
-    return corners, 14.0 + (corners - [64, 32]) @ SLOPES
+    return corners, 14.0 + (corners - [64, 42]) @ ([1.0, 0.0] - warp[0])
 
 
 def search_plainly(
@@ -87,7 +97,7 @@ def test_the_coarse_search_takes_peaks_of_correlation(n: int, max_disparity: flo
 
 
 def has_room(u: float, v: float, disparity: float) -> bool:
-    return R <= u <= 127 - R and R <= v <= 63 - R and R <= u - disparity <= 127 - R
+    return R <= u <= 127 - R and R <= v <= 83 - R and R <= u - disparity <= 127 - R
 
 
 def weights_of(wide: FloatArray) -> FloatArray:
@@ -146,7 +156,7 @@ def test_disparities_are_followed_by_gauss_newton_steps(n: int, n_steps: int) ->
     pixels, disparities = corners_of(rng, n)
     pixels += rng.choice([0.0, 0.37], (n, 2))
     starts = away(rng, disparities)
-    slopes = SLOPES + 0.05 * rng.normal(size=(n, 2))
+    slopes = [1.0, 0.0] - WARP[0] + 0.05 * rng.normal(size=(n, 2))
     found, is_valid, plain = np.full(n, 7.0), np.ones(n, np.bool_), []
     kernels.follow(left, right, pixels, starts, slopes, 0.3, n_steps, found, is_valid)
     for (u, v), start, (along, across) in zip(pixels, starts, slopes, strict=True):
@@ -159,7 +169,7 @@ def test_disparities_are_followed_by_gauss_newton_steps(n: int, n_steps: int) ->
         place, step = follow_plainly(wide, strip, MARGIN, n_steps, 1.5)
         shift = (1.0 - along) * (place - MARGIN)
         plain.append((start - shift, abs(shift) < 3.0 and abs(step) < 0.3))
-    assert_same((found, is_valid), plain, 0.3, 0.9)
+    assert_same((found, is_valid), plain, 0.2, 0.9)
 
 
 @pytest.mark.parametrize("n", [0, 1, 80])
@@ -184,7 +194,7 @@ def test_disparities_are_searched_for_near_predictions(n: int, is_refined: bool)
             place, _ = follow_plainly(wide, strip, place, 3, 0.5)
         disparity = u - column - (place - MARGIN)
         plain.append((disparity if is_refined else float(np.rint(disparity)), is_minimum))
-    assert_same((found, is_valid), plain, 0.3, 0.9)
+    assert_same((found, is_valid), plain, 0.2, 0.9)
 
 
 def fit_plainly(
@@ -255,26 +265,27 @@ def measure_plainly(
 
 @pytest.mark.parametrize("n", [0, 1, 120])
 @pytest.mark.parametrize("is_refined", [False, True])
+@pytest.mark.parametrize(("row", "blur"), [((0.93, 0.06), 1.5), ((1.0, 0.55), 5), ((1.8, 0), 5)])
 def test_corners_are_measured_where_they_match_and_nothing_else_does(
-    n: int, is_refined: bool
+    n: int, is_refined: bool, row: tuple[float, float], blur: float
 ) -> None:
-    rng = np.random.default_rng(n)
-    images = pair(rng)
-    corners, disparities = corners_of(rng, n)
+    rng, warp = np.random.default_rng(n), np.array([row, (0.0, 1.0)])
+    images = pair(rng, warp, blur=blur)
+    corners, disparities = corners_of(rng, n, warp)
     rough, is_known = away(rng, disparities), np.arange(n) != 7
     rivals = rough[:, np.newaxis] + [26.0, -26.0, np.nan] + rng.uniform(-1, 1, (n, 3))
-    rivals[::3, 2] = rough[::3] + 2.0  # the same minimum
+    rivals[9:, 2] = rough[9:] + rng.uniform(3, 8, len(rough[9:]))  # the same minimum, or not
     found, slopes, shifts = np.full(n, 7.0), np.full((n, 2), 7.0), np.full(n, 7.0)
     is_reliable = np.ones(n, np.bool_)
-    arguments: Any = images, corners, rough, is_known, rivals, 0.3, is_refined
-    kernels.measure(*images, *arguments[1:], found, slopes, is_reliable, shifts)
+    given = *images, corners, rough, is_known, rivals, 0.3, is_refined
+    kernels.measure(*given, found, slopes, is_reliable, shifts)
     for k in range(n):
         starts = np.append(rough[k] if is_known[k] else np.nan, rivals[k])
         expected, is_expected = measure_plainly(images, corners[k], starts, is_refined)
         assert is_reliable[k] == is_expected
         np.testing.assert_allclose([found[k], *slopes[k], shifts[k]], expected, rtol=1e-9)
-    if n > 1:
-        assert 0.2 < is_reliable[corners[:, 1] > 40].mean() < 0.9
+    if n > 1 and row[0] < 1.0:
+        assert 0.2 < is_reliable[corners[:, 1] > 50].mean() < 0.9
         assert 0.0 < is_reliable[corners[:, 1] < 20].mean() < 0.5
 
 
