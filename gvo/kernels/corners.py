@@ -33,8 +33,8 @@ def _write_products(image, row, rows, first):
         d, e = image[row, i], image[row, i + 2]
         f, g, h = image[below, i], image[below, i + 1], image[below, i + 2]
         # Whole numbers, and their sums, are exact.
-        along = np.float32((c + h) - (a + f) + 2 * (np.int32(e) - d))
-        across = np.float32((f + h) - (a + c) + 2 * (np.int32(g) - b))
+        along = np.float32(np.int32(c) + h - a - f + 2 * (np.int32(e) - d))
+        across = np.float32(np.int32(f) + h - a - c + 2 * (np.int32(g) - b))
         rows[first, i + 1], rows[first + 1, i + 1] = along * along, along * across
         rows[first + 2, i + 1] = across * across
 
