@@ -86,14 +86,15 @@ def _largest(values, n):
 
 
 @helper
-def _correlate(left, right, column, row, n_steps, scores):
+def _correlate(left, right, column, row, n_steps, patch, work, scores):
     """Write the normalized correlations of a patch at disparities n_steps .. 0.
 
-    a . b / sqrt(a . a  b . b) of patches less their means, energies no less than the noise; -1
-    where the place is left of the right image.
+    -1 where the place is left of the right image. Sums of all places grow side by side.
     """
-    height, width = left.shape
-    patch, n_pixels, mean = matrix(_COARSE_SIDE, _COARSE_SIDE), _COARSE_SIDE**2, 0.0
+    (height, width), n_pixels, mean = left.shape, _COARSE_SIDE**2, 0.0
+    strip, totals, squares, products = work[0], work[1], work[2], work[3]
+    for m in range(len(strip)):
+        totals[m], squares[m], products[m] = 0.0, 0.0, 0.0
     for j in range(_COARSE_SIDE):
         y = min(max(row + j - _COARSE_RADIUS_PX, 0), height - 1)
         for i in range(_COARSE_SIDE):
@@ -105,22 +106,27 @@ def _correlate(left, right, column, row, n_steps, scores):
             patch[j, i] -= mean
             energy += patch[j, i] * patch[j, i]
     energy = max(energy, _MIN_ENERGY)
+    first = column - n_steps - _COARSE_RADIUS_PX
+    for j in range(_COARSE_SIDE):
+        y = min(max(row + j - _COARSE_RADIUS_PX, 0), height - 1)
+        for m in range(n_steps + _COARSE_SIDE):
+            strip[m] = right[y, min(max(first + m, 0), width - 1)]
+        for m in range(n_steps + _COARSE_SIDE):
+            # Whole numbers: these sums are exact in any order.
+            totals[m] += strip[m]
+            squares[m] += strip[m] * strip[m]
+        for i in range(_COARSE_SIDE):
+            value = patch[j, i]
+            for step in range(n_steps + 1):
+                products[step] += value * strip[step + i]
     for step in range(n_steps + 1):
-        middle = column - n_steps + step
-        if middle < 0:
-            scores[step] = -1.0
-            continue
-        product, total, squares = 0.0, 0.0, 0.0
-        for j in range(_COARSE_SIDE):
-            y = min(max(row + j - _COARSE_RADIUS_PX, 0), height - 1)
-            for i in range(_COARSE_SIDE):
-                x = min(max(middle + i - _COARSE_RADIUS_PX, 0), width - 1)
-                value = 1.0 * right[y, x]
-                product += patch[j, i] * value
-                total += value
-                squares += value * value
-        other = max(squares - total * total / n_pixels, _MIN_ENERGY)
-        scores[step] = product / np.sqrt(energy * other)
+        total, sum_of_squares = 0.0, 0.0
+        for i in range(_COARSE_SIDE):
+            total += totals[step + i]
+            sum_of_squares += squares[step + i]
+        other = max(sum_of_squares - total * total / n_pixels, _MIN_ENERGY)
+        is_within = column - n_steps + step >= 0
+        scores[step] = products[step] / np.sqrt(energy * other) if is_within else -1.0
 
 
 @kernel(
@@ -137,10 +143,11 @@ def search(left, right, pixels, max_disparity, disparities, is_found, rivals):
     height, width = left.shape
     n_steps = min(int(np.ceil(max_disparity / REDUCTION)), width)
     n, scores = n_steps + 1, vector(n_steps + 1)
+    patch, work = matrix(_COARSE_SIDE, _COARSE_SIDE), matrix(4, n_steps + _COARSE_SIDE)
     for k in range(len(pixels)):
         column = min(int(pixels[k, 0] // REDUCTION), width - 1)
         row = min(int(pixels[k, 1] // REDUCTION), height - 1)
-        _correlate(left, right, column, row, n_steps, scores)
+        _correlate(left, right, column, row, n_steps, patch, work, scores)
         best = _largest(scores, n)
         top = scores[best]
         is_found[k] = top > _MIN_CORRELATION
