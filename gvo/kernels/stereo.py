@@ -264,33 +264,39 @@ def _fit_plane(wide, patch, right, u, row, basis, H, seen, plane):
     both cameras, nor too far from where one that faces them would be.
     """
     stride, m, pull, start = _SIDE + 2, 0, vector(4), plane[0]
+    p, q, r, s = 0.0, 0.0, 0.0, 0.0
     for j in range(-RADIUS_PX, RADIUS_PX + 1):
         for i in range(-RADIUS_PX, RADIUS_PX + 1):
             k = (j + RADIUS_PX + 1) * stride + i + RADIUS_PX + 1
             along = 0.5 * (wide[k + 1] - wide[k - 1])
-            basis[0, m], basis[1, m], basis[2, m] = along, along * i, along * j
-            basis[3, m] = wide[k - 1] - 2.0 * wide[k] + wide[k + 1]
+            blur = wide[k - 1] - 2.0 * wide[k] + wide[k + 1]
+            basis[m, 0], basis[m, 1], basis[m, 2] = along, along * i, along * j
+            basis[m, 3] = blur
+            p, q = p + along / _N_PIXELS, q + along * i / _N_PIXELS
+            r, s = r + along * j / _N_PIXELS, s + blur / _N_PIXELS
             m += 1
+    for m in range(_N_PIXELS):
+        basis[m, 0], basis[m, 1] = basis[m, 0] - p, basis[m, 1] - q
+        basis[m, 2], basis[m, 3] = basis[m, 2] - r, basis[m, 3] - s
     for a in range(4):
-        mean = 0.0
+        p, q, r, s = 0.0, 0.0, 0.0, 0.0
         for m in range(_N_PIXELS):
-            mean += basis[a, m] / _N_PIXELS
-        for m in range(_N_PIXELS):
-            basis[a, m] -= mean
-        for b in range(a + 1):
-            H[a, b] = _PRIORS[a] if a == b else 0.0
-            for m in range(_N_PIXELS):
-                H[a, b] += basis[a, m] * basis[b, m]
+            p, q = p + basis[m, a] * basis[m, 0], q + basis[m, a] * basis[m, 1]
+            r, s = r + basis[m, a] * basis[m, 2], s + basis[m, a] * basis[m, 3]
+        H[a, 0], H[a, 1], H[a, 2], H[a, 3] = p, q, r, s
+        H[a, a] += _PRIORS[a]
     factorize(H)
     for _ in range(_N_SLOPE_STEPS):
         sample(
             *(right, u - plane[0], row, 1.0 - plane[1], -plane[2], 0.0, 1.0),
             *(RADIUS_PX, RADIUS_PX, seen),
         )
-        for a in range(4):
-            pull[a] = -_PRIORS[a] * plane[a] if a == 1 or a == 2 else 0.0
-            for m in range(_N_PIXELS):
-                pull[a] += basis[a, m] * (seen[m] - patch[m])
+        p, q, r, s = 0.0, -_PRIORS[1] * plane[1], -_PRIORS[2] * plane[2], 0.0
+        for m in range(_N_PIXELS):
+            unlike = seen[m] - patch[m]
+            p, q = p + basis[m, 0] * unlike, q + basis[m, 1] * unlike
+            r, s = r + basis[m, 2] * unlike, s + basis[m, 3] * unlike
+        pull[0], pull[1], pull[2], pull[3] = p, q, r, s
         substitute(H, pull)
         # Steps are those of the left patch, whose columns are 1 - slope wide in the right image.
         width = (1.0 - plane[1]) / max(1.0 + pull[1], _MIN_WIDTH)
@@ -347,7 +353,7 @@ def measure(
     """
     wide, strip = vector((_SIDE + 2) ** 2), vector(_SIDE * _STRIP)
     patch, weights, seen = vector(_N_PIXELS), vector(_N_PIXELS), vector(_N_PIXELS)
-    basis, H, plane = matrix(4, _N_PIXELS), matrix(4, 4), vector(3)
+    basis, H, plane = matrix(_N_PIXELS, 4), matrix(4, 4), vector(3)
     differences, nothing = vector(_N_PLACES), vector(_N_PIXELS)
     for m in range(_N_PIXELS):
         nothing[m] = 0.0
