@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from statistics import median
 from typing import Any
 
 import cv2
@@ -189,7 +190,7 @@ def _conclude(
         pixels_reference=pixels[0],
         pixels_current=pixels[1],
         points_current=correspondences.current_points,
-        flow_px=float(np.median(np.hypot(*displacements.T))),
+        flow_px=median(np.hypot(*displacements.T).tolist()),
         calibration_errors=refined.calibration_errors,
     )
 

@@ -20,8 +20,10 @@ doi:10.1098/rsta.1998.0224.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from statistics import median
 
 import numpy as np
 
@@ -81,7 +83,7 @@ class _Problem:
             points = (self.matches.reference_points - T[:3, 3]) @ T[:3, :3]
             points[:, 2] = np.maximum(points[:, 2], _MIN_DEPTH_M)
             pixels.append(self.camera.project(points))
-        return float(np.median(np.hypot(*(pixels[0] - pixels[1]).T)))
+        return float(median(np.hypot(*(pixels[0] - pixels[1]).T).tolist()))
 
 
 def verify_motion(
@@ -250,10 +252,10 @@ def _prefer_recent_motion(found: Refinement, problem: _Problem, T_recent: FloatA
     if np.count_nonzero(seeds) < problem.n_needed:
         return found
     # The smaller residual of either motion shows the noise.
-    scale = np.sqrt(np.median(np.minimum(squared, recently)) / _MEDIAN_SQUARED)
+    scale = math.sqrt(median(np.minimum(squared, recently).tolist()) / _MEDIAN_SQUARED)
     if scale > _MAX_SCALE:
         return found
-    gate = GATE * max(float(scale), _MIN_SCALE)
+    gate = GATE * max(scale, _MIN_SCALE)
     misfits = squared >= gate**2
     T_other = _descend(found, T_recent, seeds & misfits, problem.n_needed)
     if T_other is None:

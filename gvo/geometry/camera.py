@@ -5,7 +5,7 @@ Pixel (0, 0) is the centre of the first pixel; x right, y down, z forward.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 import cv2
 import numpy as np
@@ -102,6 +102,11 @@ class StereoCamera(PinholeCamera):
     baseline : float
         Distance of the right camera along the left camera's x axis, metres.
 
+    Attributes
+    ----------
+    parameters : ndarray of float64, shape (7,)
+        The camera as kernels take it: fx, fy, cx, cy, baseline, width, height.
+
     Examples
     --------
     >>> camera = StereoCamera(fx=700, fy=700, cx=600, cy=180, width=1226, height=370, baseline=0.5)
@@ -110,6 +115,7 @@ class StereoCamera(PinholeCamera):
     """
 
     baseline: float
+    parameters: FloatArray = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Check the intrinsics and the baseline."""
@@ -119,12 +125,10 @@ class StereoCamera(PinholeCamera):
                 f"the baseline must be positive, got {self.baseline:g} m "
                 "(are left and right exchanged?)"
             )
-
-    @property
-    def parameters(self) -> FloatArray:
-        """The camera as kernels take it: fx, fy, cx, cy, baseline, width, height."""
         values = self.fx, self.fy, self.cx, self.cy, self.baseline, self.width, self.height
-        return np.array(values, dtype=np.float64)
+        parameters = np.array(values, dtype=np.float64)
+        parameters.flags.writeable = False
+        object.__setattr__(self, "parameters", parameters)
 
     @classmethod
     def from_pinhole(cls, pinhole: PinholeCamera, baseline: float) -> StereoCamera:

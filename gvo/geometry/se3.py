@@ -11,7 +11,7 @@ doi:10.48550/arXiv.1812.01537.
 
 from __future__ import annotations
 
-from math import atan2, hypot, isfinite, tan
+from math import atan2, hypot, isfinite, sin, tan
 
 import numpy as np
 from scipy.linalg.lapack import dgesdd, dpotrf
@@ -41,6 +41,10 @@ def make_transform(R: FloatArray, t: FloatArray) -> FloatArray:
 
 def invert(T: FloatArray) -> FloatArray:
     """Return the inverse of rigid transforms, shape (..., 4, 4)."""
+    if T.ndim == 2:  # by plain numbers: a fifth of the time of arrays
+        (a, b, c, x), (d, e, f, y), (g, h, i, z), last_row = T.tolist()
+        first, second = [a, d, g, -(a * x + d * y + g * z)], [b, e, h, -(b * x + e * y + h * z)]
+        return np.array([first, second, [c, f, i, -(c * x + f * y + i * z)], last_row])
     R_inverse = np.swapaxes(T[..., :3, :3], -1, -2)
     t_inverse = -(R_inverse @ T[..., :3, 3, np.newaxis])[..., 0]
     return make_transform(R_inverse, t_inverse)
@@ -73,19 +77,29 @@ def exp(xi: FloatArray) -> FloatArray:
     -------
     ndarray of float64, shape (..., 4, 4)
     """
-    omega, rho = xi[..., :3], xi[..., 3:]
-    angle = np.linalg.norm(omega, axis=-1)[..., np.newaxis, np.newaxis]
-    is_small = angle < 1e-5
-    safe = np.where(is_small, 1.0, angle)
-    a = np.where(is_small, 1.0 - angle**2 / 6.0, np.sin(safe) / safe)
-    # (1 - cos) by the half angle: the difference itself loses the digits of small angles.
-    b = np.where(is_small, 0.5 - angle**2 / 24.0, 2.0 * (np.sin(0.5 * safe) / safe) ** 2)
-    c = np.where(is_small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)
-    W = skew(omega)
-    W2 = W @ W
-    R = np.eye(3) + a * W + b * W2
-    V = np.eye(3) + b * W + c * W2  # eq. 174
-    return make_transform(R, (V @ rho[..., np.newaxis])[..., 0])
+    if xi.ndim > 1:
+        transforms = np.array([exp(each) for each in xi.reshape(-1, 6)])
+        return transforms.reshape(*xi.shape[:-1], 4, 4)
+    u, v, w, x, y, z = xi.tolist()
+    angle = hypot(u, v, w)
+    if angle < 1e-5:
+        a, b, c = 1.0 - angle**2 / 6.0, 0.5 - angle**2 / 24.0, 1.0 / 6.0 - angle**2 / 120.0
+    else:
+        # (1 - cos) by the half angle: the difference itself loses the digits of small angles.
+        a, b = sin(angle) / angle, 2.0 * (sin(0.5 * angle) / angle) ** 2
+        c = (angle - sin(angle)) / angle**3
+    p, q, r = v * z - w * y, w * x - u * z, u * y - v * x  # omega x rho; V rho, eq. 174
+    s, t = x + b * p + c * (v * r - w * q), y + b * q + c * (w * p - u * r)
+    n = z + b * r + c * (u * q - v * p)
+    # By plain numbers: a tenth of the time of arrays.
+    return np.array(
+        [
+            [1.0 - b * (v * v + w * w), b * u * v - a * w, b * u * w + a * v, s],
+            [b * u * v + a * w, 1.0 - b * (u * u + w * w), b * v * w - a * u, t],
+            [b * u * w - a * v, b * v * w + a * u, 1.0 - b * (u * u + v * v), n],
+            _LAST_ROW,
+        ]
+    )
 
 
 def log(T: FloatArray) -> FloatArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from statistics import median
 from typing import Generic
 
 import numpy as np
@@ -190,7 +191,8 @@ class RawChain(Generic[ObservationsT]):
             newest = self._nodes[0].estimate
             T_node_newest = se3.invert(node.estimate.T_world_frame) @ newest.T_world_frame
             # Outliers do not move the median.
-            recent = np.median([velocity for _, velocity, _ in self._recent], axis=0)
+            axes = zip(*(velocity.tolist() for _, velocity, _ in self._recent), strict=True)
+            recent = np.array([*map(median, axes)])
             T_recent = se3.exp(recent * 1e-9 * (stamp_ns - newest.stamp_ns))
             prior = MotionPrior(
                 T_predicted=T_node_newest @ self._predict(stamp_ns)[0],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -84,7 +85,7 @@ def measure_corners(
         disparities=disparities,
         slopes=slopes,
         are_reliable=are_reliable,
-        row_shift_px=float(np.median(told)) if len(told) >= _MIN_ROW_SHIFTS else None,
+        row_shift_px=median(told.tolist()) if len(told) >= _MIN_ROW_SHIFTS else None,
     )
 
 
