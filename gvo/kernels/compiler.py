@@ -5,6 +5,7 @@ Started by `gvo.kernels.jit` as a process of its own: python -m gvo.kernels.comp
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import os
 import pkgutil
@@ -20,6 +21,7 @@ os.environ |= {"NUMBA_OPT": "0", "NUMBA_DISABLE_INTEL_SVML": "1", "NUMBA_DISABLE
 
 import llvmlite.binding as llvm
 import numba
+import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
@@ -123,6 +125,7 @@ def _matrix(_context, n_rows, n_columns):
 
 def compile_all() -> bytes:
     """Return the machine code of all kernels, and say now and then how far it is."""
+    _check_layout()
     names = [each.name for each in pkgutil.iter_modules(kernels.__path__, f"{kernels.__name__}.")]
     modules = [importlib.import_module(name) for name in names if name not in _OWN]
     functions = [
@@ -138,6 +141,14 @@ def compile_all() -> bytes:
             print(f"{k + 1} of {len(functions)}", flush=True)  # noqa: T201 - to who waits
         together.link_in(_module_of(function))
     return _machine_code(together, {jit.symbol_of(each) for each in functions})
+
+
+def _check_layout() -> None:
+    """Refuse a NumPy whose arrays are laid out in another way."""
+    array, words = np.empty((2, 3)), ctypes.POINTER(ctypes.c_int64)
+    told = ctypes.cast(id(array), words)
+    if told[_DATA] != array.ctypes.data or ctypes.cast(told[_SHAPE], words)[:2] != [2, 3]:
+        raise SystemExit(f"arrays of NumPy {np.__version__} are of an unknown layout")
 
 
 def _prepare_helpers(modules: list[ModuleType]) -> None:
