@@ -196,13 +196,14 @@ def test_normal_equations_are_those_of_distances_to_planes(every: int, gate: flo
     image[:, 20:] *= np.linspace(1.0, 1.3, 20, dtype=np.float32)  # another surface, further on
     points, normals = surfaces((1.0 / scene(4, unknown=0.02)).astype(np.float32))
     inverse = (1.0 / image).astype(np.float32)
-    # Points that are seen just within and just beyond the borders.
+    # Points that are seen just within and just beyond the borders, and one behind the camera.
     edges = [[-0.5, 9], [0.3, 9], [38.7, 9], [39.5, 9], [9, -0.5], [9, 0.3], [9, 28.7], [9, 29.5]]
     rays = np.column_stack([(edges - CAMERA[2:4]) / CAMERA[:2], np.ones(8)])
     columns, rows = np.clip(np.rint(edges), 0, [39, 29]).astype(int).T
     there = rays / inverse[rows, columns, np.newaxis] @ T[:3, :3].T + T[:3, 3]
-    points = np.concatenate([there, points])
-    normals = np.concatenate([np.tile([0.0, 0.0, 1.0], (8, 1)), normals])
+    behind = T[:3, 3] - T[:3, 2]
+    points = np.concatenate([[behind], there, points])
+    normals = np.concatenate([np.tile([0.0, 0.0, 1.0], (9, 1)), normals])
     H, g, squares = np.full((6, 6), 7.0), np.full(6, 7.0), np.full(1, 7.0)
     n = kernels.linearize_planes(T, points, normals, inverse, CAMERA, gate, every, H, g, squares)
     expected_H, expected_g, rows = np.zeros((6, 6)), np.zeros(6), []
