@@ -23,8 +23,9 @@ DONE, BEHIND, OPEN = 0, 1, 2
 """How a kernel ended: well; with a point behind the camera; with a direction left open."""
 
 # The first round only has to be good enough to choose the inliers again; then the most there are.
-_N_FIRST_STEPS = 2
-_N_STEPS = 10
+# Integers of NumPy: for each of Python the descent would be compiled anew.
+_N_FIRST_STEPS = np.int64(2)
+_N_STEPS = np.int64(10)
 # Squared length of a step, in sigmas, that no longer matters.
 _CONVERGED = 1e-3
 # Variance inflation of a parameter above which a direction of motion is unobservable.

@@ -21,6 +21,8 @@ REDUCTION = 4
 COARSE_ERROR_PX = REDUCTION + 1
 """Largest error of the coarse search, pixels of the full image."""
 
+# Numba compiles a helper anew for each integer of Python that it is given, not for NumPy's.
+_RADIUS = np.int64(RADIUS_PX)
 _SIDE = 2 * RADIUS_PX + 1
 _N_PIXELS = _SIDE * _SIDE
 _MARGIN_PX = REACH_PX + 1
@@ -38,8 +40,8 @@ _PEAK_STEPS = 2
 _MAX_GAP = 0.25
 # Gauss-Newton steps from the coarse search, and after the parabola through squared differences: the
 # last moves by less than 0.01 pixels.
-_N_SEARCH_STEPS = 6
-_N_FINE_STEPS = 3
+_N_SEARCH_STEPS = np.int64(6)
+_N_FINE_STEPS = np.int64(3)
 # Steps of the disparity: the largest, that after a parabola, and the last of what is at rest.
 _MAX_STEP_PX = 1.5
 _MAX_FINE_STEP_PX = 0.5
@@ -289,7 +291,7 @@ def _fit_plane(wide, patch, right, u, row, basis, H, seen, plane):
     for _ in range(_N_SLOPE_STEPS):
         sample(
             *(right, u - plane[0], row, 1.0 - plane[1], -plane[2], 0.0, 1.0),
-            *(RADIUS_PX, RADIUS_PX, seen),
+            *(_RADIUS, _RADIUS, seen),
         )
         p, q, r, s = 0.0, -_PRIORS[1] * plane[1], -_PRIORS[2] * plane[2], 0.0
         for m in range(_N_PIXELS):
@@ -374,7 +376,7 @@ def measure(
             # At whole columns nothing is interpolated twice.
             column = np.floor(u - start)
             reach = RADIUS_PX + _MARGIN_PX
-            sample(right, column, row, 1.0, 0.0, 0.0, 1.0, reach, RADIUS_PX, strip)
+            sample(right, column, row, 1.0, 0.0, 0.0, 1.0, reach, _RADIUS, strip)
             if is_refined:
                 place = u - start - column + _MARGIN_PX
                 place, step = _follow(weights, at_rest, strip, place, _N_SEARCH_STEPS, _MAX_STEP_PX)
@@ -383,7 +385,7 @@ def measure(
             else:
                 place, is_at_rest = _nearest(patch, strip, differences)
                 disparity = np.rint(u - column - (place - _MARGIN_PX))
-            sample(right, u - disparity, row, 1.0, 0.0, 0.0, 1.0, RADIUS_PX, RADIUS_PX, seen)
+            sample(right, u - disparity, row, 1.0, 0.0, 0.0, 1.0, _RADIUS, _RADIUS, seen)
             unlike = _variance(seen, patch) if is_at_rest else np.inf
             if rank == 0:
                 disparities[k], first_unlike = disparity, unlike
@@ -401,7 +403,7 @@ def measure(
         else:
             sample(
                 *(right, u - disparities[k], row, 1.0, 0.0, 0.0, 1.0),
-                *(RADIUS_PX, RADIUS_PX, seen),
+                *(_RADIUS, _RADIUS, seen),
             )
         if is_reliable[k]:
             row_shifts[k] = _row_shift(wide, patch, seen)
@@ -428,7 +430,7 @@ def follow(left, right, pixels, predicted, slopes, row_offset_px, n_steps, dispa
         along, across = slopes[k, 0], slopes[k, 1]
         sample(
             *(right, u - start, v + row_offset_px, 1.0 - along, -across, 0.0, 1.0),
-            *(reach, RADIUS_PX, strip),
+            *(reach, _RADIUS, strip),
         )
         at_rest = _weigh(wide, patch, weights)
         place, step = _follow(weights, at_rest, strip, 1.0 * _MARGIN_PX, n_steps, _MAX_STEP_PX)
@@ -458,7 +460,7 @@ def search_near(left, right, pixels, predicted, row_offset_px, is_refined, dispa
             continue
         column, row = np.floor(u - start), v + row_offset_px
         sample(left, u, v, 1.0, 0.0, 0.0, 1.0, RADIUS_PX + 1, RADIUS_PX + 1, wide)
-        sample(right, column, row, 1.0, 0.0, 0.0, 1.0, reach, RADIUS_PX, strip)
+        sample(right, column, row, 1.0, 0.0, 0.0, 1.0, reach, _RADIUS, strip)
         at_rest = _weigh(wide, patch, weights)
         place, is_valid[k] = _nearest(patch, strip, differences)
         if is_refined:

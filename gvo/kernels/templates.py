@@ -15,6 +15,8 @@ from gvo.kernels.sampling import sample
 RADIUS_PX = 4
 """Half size of the patches, pixels."""
 
+# An integer of NumPy: for one of Python the helper would be compiled anew.
+_RADIUS = np.int64(RADIUS_PX)
 _SIDE = 2 * RADIUS_PX + 1
 _N_PIXELS = _SIDE * _SIDE
 # Variance of a gradient that is noise, grey values squared: keeps flat patches from dividing by
@@ -88,7 +90,7 @@ def align(image, values, gradients, inverses, indices, warps, pixels, is_found):
                 break
             sample(
                 *(image, u, v, warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1]),
-                *(RADIUS_PX, RADIUS_PX, seen),
+                *(_RADIUS, _RADIUS, seen),
             )
             total, squares, pull_u, pull_v = 0.0, 0.0, 0.0, 0.0
             for m in range(_N_PIXELS):
