@@ -1,14 +1,14 @@
-"""Trajectory files: TUM, KITTI and EuRoC, and covariances as CSV, read and written."""
+"""Trajectory files of many forms read; TUM, KITTI, EuRoC, and covariances as CSV written."""
 
 from __future__ import annotations
 
 import math
 import re
 from array import array
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from gvo._text import cut, exists, plain_floats, text_lines
 from gvo.errors import TrajectoryError, write_faults
 from gvo.geometry import se3
+from gvo.trajectory.forms import TUM, UNITS_NS, Form, Sample, recognise
 from gvo.trajectory.trajectory import StampsFrom, Trajectory, format_stamp, parse_stamp
 from gvo.types import BoolArray, FloatArray, IntArray
 
@@ -30,15 +31,11 @@ MAX_LINES = 3_000_000
 _MAX_NUMBERS = 18_200_000  # of a table: poses of a day at 30 Hz
 _BLOCK = 4096  # poses that are made of rows at once, by steps that take several times their memory
 _MAX_REASON = 300  # characters
-_FORMATS = (
-    "8 columns (TUM: stamp tx ty tz qx qy qz qw), 12 (KITTI: the first three rows of the pose) "
-    "or 17 (EuRoC state)"
-)
-_SCALAR_FIRST = re.compile(r"q\w*w\b.*q\w*x\b")
-_MAX_HEADER = 2000  # characters; the search takes the square of it
+_SAMPLE = 100  # rows by which the form of a file is told
+_NUMBER = re.compile(r"[-+.]?\d|nan$")
+_SECOND_NS = 1_000_000_000
+_TUM_ROW = "stamp tx ty tz qx qy qz qw"
 _AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
-# rounding of published files: four decimals in TUM's ground truths, seven digits in KITTI's
-_ROUNDING = 1e-2
 
 _EUROC_HEADER = (
     "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], "
@@ -52,18 +49,20 @@ COVARIANCE_HEADER = "stamp_ns," + ",".join(
 
 
 def read_trajectory(path: str | Path, *, is_growing: bool = False) -> Trajectory:
-    """Read poses from a TUM, KITTI or EuRoC file, recognised by its columns and header.
+    """Read a file of poses in the form of TUM, KITTI, EuRoC or another system (`FORMS`).
 
-    A KITTI file holds no stamps. They are read from a `times.txt` of as many rows beside it (or
-    `sequences/NN/times.txt` for `poses/NN.txt`); without one, row n gets n seconds, and
-    `stamps_from` is "rows". Of successive rows of a TUM file with the same stamp the last is
-    kept, see `Trajectory.n_repeated`. Where `NAME_covariance.csv` lies beside `NAME.txt`, as in a
-    run's folder, and holds all its stamps, the poses have these covariances.
+    A line that names the columns decides which form it is; else the only system does whose
+    columns, separator and stamps fit. A KITTI file holds no stamps. They are read from a
+    `times.txt` of as many rows beside it (or `sequences/NN/times.txt` for `poses/NN.txt`);
+    without one, row n gets n seconds, and `stamps_from` is "rows". Of successive rows with the
+    same stamp the last is kept, see `Trajectory.n_repeated`. Where `NAME_covariance.csv` lies
+    beside `NAME.txt`, as in a run's folder, and holds all its stamps, the poses have these
+    covariances.
 
     Parameters
     ----------
     path : str or Path
-        Text; fields are separated by blanks or commas, comments start with #.
+        Text; fields are separated by blanks, commas or semicolons, comments start with #.
     is_growing : bool
         A TUM file that is still being written: it may be missing or empty, its rows may be in any
         order, and an incomplete last line is ignored.
@@ -71,35 +70,42 @@ def read_trajectory(path: str | Path, *, is_growing: bool = False) -> Trajectory
     Returns
     -------
     Trajectory
-        T_world_frame of TUM and KITTI files, T_world_body of EuRoC's ground truth.
+        T_world_frame of TUM and KITTI files, T_world_body of EuRoC's ground truth and of systems
+        with an IMU.
 
     Raises
     ------
     TrajectoryError
-        If the file is missing, empty or malformed; names file and line.
+        If the file is missing, empty or malformed, or none or several forms fit; names file and
+        line.
     """
     path = Path(path)
     rows = read_rows(path, is_growing=is_growing)
-    first = next(rows, None)
-    if first is None and is_growing:
+    sample = list(islice(rows, _SAMPLE))
+    if not sample and is_growing:
         return Trajectory(stamps_ns=np.empty(0, dtype=np.int64), T_world_frame=np.empty((0, 4, 4)))
-    if first is None:
-        raise TrajectoryError(f"{path}: holds no poses; expected rows of {_FORMATS}")
-    rows = chain([first], rows)
+    if not sample:
+        raise TrajectoryError(f"{path}: holds no poses; expected rows like TUM's: {_TUM_ROW}")
     if is_growing:
-        return _read_tum(path, rows, is_sorted=False)
-    return _with_covariances(_parse(path, first, rows), path)
+        return _read(path, chain(sample, rows), TUM, n_columns=8, is_sorted=False)
+    header = list(sample[0].comments)
+    if len(sample) > 1 and not any(map(_NUMBER.match, sample[0].fields)):
+        header.append(sample.pop(0).text)
+    form = _recognise(sample, header)
+    n_columns = len(sample[0].fields)
+    return _with_covariances(_read(path, chain(sample, rows), form, n_columns=n_columns), path)
 
 
-def _parse(path: Path, first: Row, rows: Iterable[Row]) -> Trajectory:
-    n_columns = len(first.fields)
-    if n_columns == 17 or (n_columns >= 8 and _SCALAR_FIRST.search(first.header[:_MAX_HEADER])):
-        return _read_euroc(path, rows, n_columns)
-    if n_columns == 12:
-        return _read_kitti(path, rows)
-    if n_columns == 8:
-        return _read_tum(path, rows)
-    raise first.error(f"expected {_FORMATS}, got {n_columns}")
+def _recognise(rows: Sequence[Row], header: Sequence[str]) -> Form:
+    first = rows[0]
+    fields = [row.fields for row in rows if len(row.fields) == len(first.fields)]
+    text = first.text.strip()
+    separator = next((mark for mark in (";", ", ", ",") if mark in text), "")
+    separator = ",," if text.endswith(",") else separator
+    try:
+        return recognise(Sample(fields, separator, header))
+    except ValueError as error:
+        raise first.error(str(error)) from None
 
 
 def _with_covariances(trajectory: Trajectory, path: Path) -> Trajectory:
@@ -285,43 +291,42 @@ def _write_lines(path: str | Path, lines: Iterable[str]) -> None:
         file.writelines(f"{line}\n" for line in lines)
 
 
-def _read_tum(path: Path, rows: Iterable[Row], *, is_sorted: bool = True) -> Trajectory:
-    table = read_table(path, rows, slice(1, 8), n_columns=8, unit_ns=1_000_000_000)
+def _read(
+    path: Path, rows: Iterable[Row], form: Form, *, n_columns: int, is_sorted: bool = True
+) -> Trajectory:
+    columns = slice(min(form.columns), max(form.columns) + 1)
+    unit_ns = UNITS_NS.get(form.stamps)
+    stamp = form.names.index("stamp") if unit_ns else 0
+    table = read_table(path, rows, columns, n_columns=n_columns, unit_ns=unit_ns, stamp=stamp)
     if not is_sorted:
         table = table.take(np.argsort(table.stamps_ns, kind="stable"))
-    # TUM's own ground truths repeat stamps, rounded to 0.1 ms; their tools keep the last row
-    is_last = np.diff(table.stamps_ns, append=table.stamps_ns[-1] + 1) != 0
-    table = table.take(is_last)
+    n_rows = len(table.numbers)
+    stamps_from: StampsFrom = "file"
+    if unit_ns:
+        # TUM's own ground truths repeat stamps, rounded to 0.1 ms; their tools keep the last row
+        table = table.take(np.diff(table.stamps_ns, append=table.stamps_ns[-1] + 1) != 0)
+        stamps_ns = check_increasing(table)
+    else:
+        stamps_ns = np.arange(n_rows, dtype=np.int64) * _SECOND_NS
+    if form.stamps in ("index", "none"):
+        stamps_ns, stamps_from = _kitti_stamps(path, stamps_ns)
     return Trajectory(
-        stamps_ns=check_increasing(table),
-        T_world_frame=_poses(table, partial(_of_quaternions, order=[3, 4, 5, 6])),
-        n_repeated=int(np.count_nonzero(~is_last)),
+        stamps_ns=stamps_ns,
+        T_world_frame=_poses(table, partial(_transforms, form)),
+        stamps_from=stamps_from,
+        n_repeated=n_rows - len(table.numbers),
     )
 
 
-def _read_euroc(path: Path, rows: Iterable[Row], n_columns: int) -> Trajectory:
-    table = read_table(path, rows, slice(1, 8), n_columns=n_columns, unit_ns=1)
-    stamps_ns = check_increasing(table)
-    T_world_frame = _poses(table, partial(_of_quaternions, order=[4, 5, 6, 3]))
-    return Trajectory(stamps_ns=stamps_ns, T_world_frame=T_world_frame)
-
-
-def _read_kitti(path: Path, rows: Iterable[Row]) -> Trajectory:
-    table = read_table(path, rows, slice(0, 12), n_columns=12)
-    T_world_frame = _poses(table, _of_matrices)
-    stamps_ns, stamps_from = _kitti_stamps(path, len(T_world_frame))
-    return Trajectory(stamps_ns=stamps_ns, T_world_frame=T_world_frame, stamps_from=stamps_from)
-
-
-def _kitti_stamps(path: Path, n_rows: int) -> tuple[IntArray, StampsFrom]:
+def _kitti_stamps(path: Path, rows_ns: IntArray) -> tuple[IntArray, StampsFrom]:
     beside = path.parent / "times.txt"
     official = path.parent.parent / "sequences" / path.stem / "times.txt"
     for times in (beside, official):
         if times.is_file():
-            table = read_table(times, read_rows(times), slice(0), unit_ns=1_000_000_000)
-            if len(table.stamps_ns) == n_rows:
+            table = read_table(times, read_rows(times), slice(0), unit_ns=_SECOND_NS)
+            if len(table.stamps_ns) == len(rows_ns):
                 return check_increasing(table), "times"
-    return np.arange(n_rows, dtype=np.int64) * 1_000_000_000, "rows"
+    return rows_ns, "rows"
 
 
 def _poses(table: Table, convert: Callable[[Table], FloatArray]) -> FloatArray:
@@ -331,19 +336,15 @@ def _poses(table: Table, convert: Callable[[Table], FloatArray]) -> FloatArray:
     return T
 
 
-def _of_quaternions(table: Table, order: list[int]) -> FloatArray:
-    quaternions_xyzw = table.values[:, order]
-    norms = np.linalg.norm(quaternions_xyzw, axis=1)
-    table.refuse(np.abs(norms - 1.0) > _ROUNDING, "the quaternion is not of length one")
-    R = np.asarray(Rotation.from_quat(quaternions_xyzw).as_matrix())
-    return se3.make_transform(R, table.values[:, :3])
-
-
-def _of_matrices(table: Table) -> FloatArray:
-    P = table.values.reshape(-1, 3, 4)
-    is_wrong = ~se3.is_rotation(P[:, :, :3], tolerance=_ROUNDING)
-    table.refuse(is_wrong, "the first three columns of the pose are no rotation")
-    return se3.make_transform(se3.nearest_rotation(P[:, :, :3]), P[:, :, 3])
+def _transforms(form: Form, table: Table) -> FloatArray:
+    pose = table.values[:, np.array(form.columns) - min(form.columns)]
+    t, rotations = pose[:, :3], pose[:, 3:]
+    table.refuse(~form.is_rotation(rotations), form.fault)
+    if rotations.shape[1] == 9:
+        return se3.make_transform(se3.nearest_rotation(rotations.reshape(-1, 3, 3)), t)
+    is_quaternion = rotations.shape[1] == 4
+    R = Rotation.from_quat(rotations) if is_quaternion else Rotation.from_euler("xyz", rotations)
+    return se3.make_transform(np.asarray(R.as_matrix()), t)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -352,8 +353,9 @@ class Row:
 
     path: Path
     number: int
+    text: str
     fields: list[str]
-    header: str
+    comments: list[str]
 
     def error(self, text: str) -> TrajectoryError:
         """Return an error with this text that names file and line."""
@@ -361,7 +363,7 @@ class Row:
 
 
 def read_rows(path: Path, *, is_growing: bool = False) -> Iterator[Row]:
-    """Yield the rows of a text file, separated by blanks or commas; comments start with #.
+    """Yield the rows of a text file, separated by blanks, commas or semicolons.
 
     Parameters
     ----------
@@ -373,7 +375,7 @@ def read_rows(path: Path, *, is_growing: bool = False) -> Iterator[Row]:
     Yields
     ------
     Row
-        Lines with at least one field.
+        Lines with at least one field, with the comments (#) since the row before.
 
     Raises
     ------
@@ -382,15 +384,15 @@ def read_rows(path: Path, *, is_growing: bool = False) -> Iterator[Row]:
     """
     if is_growing and not exists(path):
         return
-    header: list[str] = []
+    comments: list[str] = []
     for number, line in text_lines(path, TrajectoryError, max_lines=MAX_LINES):
         text, mark, comment = line.rstrip("\n").partition("#")
-        fields = text.replace(",", " ").split()
+        fields = text.replace(";" if ";" in text else ",", " ").split()
         if mark:
-            header.append(comment)
+            comments.append(comment)
         if fields and not (is_growing and line[-1] != "\n"):
-            yield Row(path=path, number=number, fields=fields, header=" ".join(header))
-            header = []
+            yield Row(path=path, number=number, text=text, fields=fields, comments=comments)
+            comments = []
 
 
 class Table(NamedTuple):
@@ -403,7 +405,7 @@ class Table(NamedTuple):
     numbers : ndarray of int64, shape (n,)
         Line numbers, from one.
     stamps_ns : ndarray of int64, shape (n,)
-        Of the first column; zero where it holds none.
+        Zero where the rows hold none.
     values : ndarray of float64, shape (n, k)
         Finite numbers of some columns.
     """
@@ -430,6 +432,7 @@ def read_table(
     *,
     n_columns: int | None = None,
     unit_ns: int | None = None,
+    stamp: int = 0,
     limit: float = MAX_POSITION_M,
 ) -> Table:
     """Return rows as numbers."""
@@ -441,7 +444,7 @@ def read_table(
             )
         try:
             values.extend(plain_floats(row.fields[columns]))
-            stamps_ns.append(parse_stamp(row.fields[0], unit_ns=unit_ns) if unit_ns else 0)
+            stamps_ns.append(parse_stamp(row.fields[stamp], unit_ns=unit_ns) if unit_ns else 0)
         except ValueError as error:
             raise row.error(f"{error}; expected {len(row.fields)} numbers") from None
         numbers.append(row.number)
