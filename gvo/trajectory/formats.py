@@ -30,7 +30,7 @@ MAX_LINES = 3_000_000
 
 _MAX_NUMBERS = 18_200_000  # of a table: poses of a day at 30 Hz
 _BLOCK = 4096  # poses that are made of rows at once, by steps that take several times their memory
-_MAX_REASON = 300  # characters
+_MAX_REASON = 400  # characters
 _SAMPLE = 100  # rows by which the form of a file is told
 _NUMBER = re.compile(r"[-+.]?\d|nan$")
 _SECOND_NS = 1_000_000_000

@@ -39,6 +39,7 @@ _MAX_INDEX = 1e7
 _LARGEST = 1e20  # of a number: any stamp in int64
 _MAX_HEADER = 2000  # characters
 _REMEDY = "name the columns in a first line like '# stamp [ns] x y z qw qx qy qz'"
+_UNKNOWN = f"no form of poses that gvo knows; {_REMEDY}; of a matrix keep three rows, as KITTI does"
 _UNNAMED: tuple[Stamps, ...] = ("s", "ns")
 _UNIT_NAMES: dict[str, Stamps] = {"": "s", "m": "ms", "u": "us", "n": "ns"}
 _OF_POSITION = {"", "t", "p", "pos", "position", "translation", "pose"}
@@ -175,8 +176,8 @@ def recognise(sample: Sample) -> Form:
     if len(rotated or forms) == 1:
         return (rotated or forms)[0]
     fitting = " and ".join(form.describe() for form in rotated)
-    finding = f"this fits {fitting}" if rotated else "no form of poses that gvo knows"
-    raise ValueError(f"{sample.describe()}: {finding}; {_REMEDY}")
+    reason = f"this fits {fitting}; {_REMEDY}" if rotated else _UNKNOWN
+    raise ValueError(f"{sample.describe()}: {reason}")
 
 
 def _has_rotations(form: Form, sample: Sample) -> bool:
@@ -219,10 +220,11 @@ def _form_of_names(sample: Sample, names: Sequence[str], unit: Stamps | None) ->
     if not has_stamps:
         units = ["none"] if len(names) == len((*_POSITION, *_QUATERNION)) else []
     if not units:
+        missing = "unit of the stamps" if has_stamps else "stamps"
         stamp, step = shortened(sample.rows[0][column]), _step(sample.numbers([column]))
         raise ValueError(
-            f"the unit of the stamps is not clear ({stamp}, median step {step:g}); name it in the "
-            "first line, like '# stamp [s] x y z qx qy qz qw' or stamp [ns]"
+            f"the header names no {missing} (first {stamp}, median step {step:g}); "
+            "call the column 'stamp [s]', '[ms]', '[us]' or '[ns]'"
         )
     return Form("the header", (len(names),), units[0], " ".join(names))
 

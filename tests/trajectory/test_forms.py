@@ -161,6 +161,10 @@ def test_the_documentation_has_a_row_for_each_system() -> None:
             "# TUM format: timestamp tx ty tz qx qy qz qw\n# timestamp tx ty tz qx qy qz qw",
             lambda k: f"{seconds(k)} {position(k)} {xyzw(k)}",
         ),
+        (
+            "# not (w, x, y, z), but\n# timestamp tx ty tz qx qy qz qw",
+            lambda k: f"{seconds(k)} {position(k)} {xyzw(k)}",
+        ),
         ("t;q_x;q_y;q_z;q_w;p_x;p_y;p_z", lambda k: f"{seconds(k)};{xyzw(k)} {position(k)}"),
         (
             "# stamp, position (x, y, z), quaternion (w, x, y, z)",
@@ -206,6 +210,7 @@ def test_a_header_decides(tmp_path: Path, header: str, row: Row) -> None:
             r":1: 17 columns between commas.*fits EuRoC \(.*qw qx.* and OKVIS \(.*qz qw;",
         ),
         ("", lambda k: f"{seconds(k)} {position(k)}", r":1: 4 columns between blanks.*no form"),
+        ("", lambda k: f"{rows_of_matrix(k)} 0 0 0 1", ":1: 16 columns.*no form.*keep three rows"),
         (
             "",
             lambda k: f"{STAMPS_NS[k]} {position(k)} {wxyz(k)}",
@@ -216,7 +221,11 @@ def test_a_header_decides(tmp_path: Path, header: str, row: Row) -> None:
             lambda k: f"{STAMPS_NS[k]},{position(k, ',')},{wxyz(k, ',')}",
             r":1: 8 columns.*fits TUM in nanoseconds \(.* and EuRoC \(.*; name the columns",
         ),
-        ("x y z qx qy qz qw id stamp\n", lambda k: f"{position(k)} {xyzw(k)} 1", "the unit"),
+        (
+            "x y z qx qy qz qw id stamp\n",
+            lambda k: f"{position(k)} {xyzw(k)} 1",
+            ":2: the header names no stamps",
+        ),
         ("", lambda k: f"{50 * k} {position(k)} {xyzw(k)}", ":1: 8 columns.*first of them '0'"),
         (
             "",
@@ -228,8 +237,16 @@ def test_a_header_decides(tmp_path: Path, header: str, row: Row) -> None:
             lambda k: f"{seconds(k)} {position(k)} {xyzw(k)}",
             ":2: 8 columns.*no form",
         ),
-        ("# tx ty tz qx qy qz qw id\n", lambda k: f"{position(k)} {xyzw(k)} {k}", ":2: the unit"),
-        (TUM_HEADER, lambda k: f"{50 * k} {position(k)} {xyzw(k)}", r":2: the unit.*step 50\)"),
+        (
+            "# tx ty tz qx qy qz qw id\n",
+            lambda k: f"{position(k)} {xyzw(k)} {k}",
+            ":2: the header names no stamps",
+        ),
+        (
+            TUM_HEADER,
+            lambda k: f"{50 * k} {position(k)} {xyzw(k)}",
+            r":2: the header names no unit of the stamps.*step 50\)",
+        ),
         (
             "# timestamp [s] qx qy qz qw x y z\n",
             lambda k: f"{seconds(k)} {position(k)} {xyzw(k)}",
