@@ -70,7 +70,7 @@ PROCESS_FIGURES = {"CPU [s]": 2, "wall [s]": 2, "peak [MB]": 0}
 """What is printed of a process, and with how many decimals."""
 FRAME_FIGURES = {"CPU/frame [ms]": 2, "wall/frame [ms]": 2, "start CPU [s]": 2, "peak [MB]": 0}
 # Of a recording, to measure starting up: a few frames.
-MOMENT_S = 0.3
+MOMENT_S = 0.15
 
 
 class Round(NamedTuple):

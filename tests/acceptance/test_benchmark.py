@@ -94,10 +94,14 @@ def test_the_cost_of_a_run_is_told_beside_the_yardstick(
 
 
 def checkout(folder: Path, main: str) -> Path:
-    """Write another version of gvo, all of whose commands do the same."""
+    """Write another version of gvo, all of whose commands do the same, but tell of frames."""
     (folder / "gvo").mkdir(parents=True)
     (folder / "gvo" / "__init__.py").touch()
-    (folder / "gvo" / "cli.py").write_text(f"import sys\n\ndef main():\n    {main}\n")
+    frames = "'\\n' * (3 if '--duration' in sys.argv else 9)"
+    (folder / "gvo" / "cli.py").write_text(
+        f"import os, sys\n\ndef main():\n    {main}\n    os.mkdir(sys.argv[-1])\n"
+        f"    open(sys.argv[-1] + '/frames.csv', 'w').write({frames})\n"
+    )
     return folder
 
 
@@ -110,15 +114,22 @@ def test_whole_runs_of_two_versions_take_turns(
     own = checkout(tmp_path / "own", f"{note.format('own')}; text = 'x' * 10**8; text.count('y')")
     monkeypatch.setattr("gvo.__file__", str(own / "gvo" / "__init__.py"))
     options = ["--demo", "--rounds", 1, "--set", "klt.n_corners=9", "--against", other]
-    rows = table(benchmark("cost", "room.bag", *options), "command")
-    for row in (rows["room.bag"], rows["demo"]):
-        cpu, memory = (list(map(float, row[k : k + 3])) for k in (0, 6))
+    printed = benchmark("cost", "room.bag", *options)
+    of_frames, whole = table(printed, "command")["room.bag"], table(printed, "command", 1)["demo"]
+    # Of a recording after CPU and elapsed time per frame, which importing is no part of.
+    for row, places in ((of_frames, (6, 9)), (whole, (0, 6))):
+        cpu, memory = (list(map(float, row[k : k + 3])) for k in places)
         assert cpu[0] > cpu[1] > 0.0
         assert memory[0] > memory[1] + 80.0
         assert memory[2] == pytest.approx(memory[0] / memory[1], rel=0.1)
-    run = f"run {tmp_path / 'room.bag'} --set klt.n_corners=9 --out"
+    run = f"run {tmp_path / 'room.bag'} --no-report --set klt.n_corners=9"
+    runs = [f"{run} --out", f"{run} --duration 0.15 --out"]
     words = [
-        f"{who} {what}" for what in (run, "demo --out") for _ in "12" for who in ("own", "other")
+        f"{who} {what}"
+        for commands in (runs, ["demo --out"])
+        for _ in "12"
+        for who in ("own", "other")
+        for what in commands
     ]
     assert log.read_text().splitlines() == words
 

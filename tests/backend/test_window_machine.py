@@ -283,7 +283,7 @@ class WindowMachine(RuleBasedStateMachine):
         n_restored, poses = before
         # A graph that was made anew is the same but for rounding, also thousands of km away.
         farthest = max(float(np.abs(T[:3, 3]).max()) for T in poses.values())
-        atol = 0.0 if self.window.counts.n_restored == n_restored else 1e-6 + 1e-8 * farthest
+        atol = 0.0 if self.window.counts.n_restored == n_restored else 1e-6 * max(1.0, farthest)
         after = self.window.poses()
         assert list(after) == list(poses)
         for frame, T in after.items():
