@@ -20,8 +20,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import cache, wraps
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -216,17 +215,11 @@ def _compiled(path: Path, say: Callable[..., None]) -> bytes:
     command = [sys.executable, "-m", "gvo.kernels.compiler", str(path)]
     paths = [str(_FOLDER.parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
-    with _running(command, environment) as lines:
-        for line in lines:
+    started = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)  # noqa: S603
+    with started as compiler:
+        for line in compiler.stdout or ():
             say("compiling, once on this machine: %s", line.strip())
     code = _read(path)
     if code is None:
         raise GvoError(f"the kernels could not be compiled: {' '.join(command)} tells why")
     return code
-
-
-@contextmanager
-def _running(command: list[str], environment: dict[str, str]) -> Iterator[Any]:
-    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)  # noqa: S603
-    with process:
-        yield process.stdout

@@ -148,14 +148,21 @@ def away(rng: np.random.Generator, disparities: FloatArray) -> FloatArray:
     return starts
 
 
+def searches(
+    rng: np.random.Generator, n: int
+) -> tuple[tuple[ImageArray, ImageArray], FloatArray, FloatArray]:
+    """Return images, pixels between whole ones, and where to search for their disparities."""
+    images = pair(rng)
+    pixels, disparities = corners_of(rng, n)
+    pixels += rng.choice([0.0, 0.37], (n, 2))
+    return images, pixels, away(rng, disparities)
+
+
 @pytest.mark.parametrize("n", [0, 1, 80])
 @pytest.mark.parametrize("n_steps", [1, 4])
 def test_disparities_are_followed_by_gauss_newton_steps(n: int, n_steps: int) -> None:
     rng = np.random.default_rng(n)
-    left, right = pair(rng)
-    pixels, disparities = corners_of(rng, n)
-    pixels += rng.choice([0.0, 0.37], (n, 2))
-    starts = away(rng, disparities)
+    (left, right), pixels, starts = searches(rng, n)
     slopes = [1.0, 0.0] - WARP[0] + 0.05 * rng.normal(size=(n, 2))
     found, is_valid, plain = np.full(n, 7.0), np.ones(n, np.bool_), []
     kernels.follow(left, right, pixels, starts, slopes, 0.3, n_steps, found, is_valid)
@@ -176,10 +183,7 @@ def test_disparities_are_followed_by_gauss_newton_steps(n: int, n_steps: int) ->
 @pytest.mark.parametrize("is_refined", [False, True])
 def test_disparities_are_searched_for_near_predictions(n: int, is_refined: bool) -> None:
     rng = np.random.default_rng(n)
-    left, right = pair(rng)
-    pixels, disparities = corners_of(rng, n)
-    pixels += rng.choice([0.0, 0.37], (n, 2))
-    starts = away(rng, disparities)
+    (left, right), pixels, starts = searches(rng, n)
     found, is_valid, plain = np.full(n, 7.0), np.ones(n, np.bool_), []
     kernels.search_near(left, right, pixels, starts, 0.3, is_refined, found, is_valid)
     for (u, v), start in zip(pixels, starts, strict=True):
