@@ -25,6 +25,7 @@ _KINDS = (
 )
 # By such a name in it a folder is known to be one recording.
 FOLDER_MARKERS = ("metadata.yaml", "calib.txt", "times.txt", "mav0", "cam0", "rgb.txt")
+_PACKED = (".gz", ".bz2", ".xz", ".zst", ".zstd", ".lz4", ".zip", ".tar", ".tgz", ".7z")
 _TOPICS = ("left", "right", "color", "depth")
 
 
@@ -113,7 +114,18 @@ def _open_folder(path: Path, config: Config, options: RecordingOptions) -> Sourc
         return EurocSource(path, calibration=options.calibration, config=config)
     if (path / "rgb.txt").is_file():
         return TumSource(path, calibration=options.calibration, config=config)
-    raise RecordingError(f"{path}: not a recording; {_KINDS}")
+    raise RecordingError(f"{path}: {_what_is_missing(path) or 'not a recording'}; {_KINDS}")
+
+
+def _what_is_missing(path: Path) -> str:
+    """Say what keeps a path from being a recording, where it looks like one."""
+    if path.suffix in _PACKED:
+        return "packed files are not read; unpack it first"
+    lists = sorted(path.glob("*assoc*.txt"))
+    if not lists and not all((path / name).is_dir() for name in ("rgb", "depth")):
+        return ""
+    words = "rgb.txt and depth.txt are missing, each with rows of a stamp and a file"
+    return f"{words}; write them from the columns of {lists[0].name}" if lists else words
 
 
 def _is_kitti(path: Path) -> bool:

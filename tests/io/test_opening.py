@@ -25,6 +25,21 @@ def test_other_files_and_folders_are_refused(tmp_path: Path) -> None:
         open_recording(path)
 
 
+def test_what_a_recording_lacks_is_said(tmp_path: Path) -> None:
+    (tmp_path / "associations.txt").write_text("1.0 rgb/1.png 1.0 depth/1.png\n")
+    with pytest.raises(RecordingError, match=r"rgb\.txt and depth\.txt are .* associations\.txt;"):
+        open_recording(tmp_path)
+    (tmp_path / "associations.txt").unlink()
+    for name in ("rgb", "depth"):
+        (tmp_path / name).mkdir()
+    with pytest.raises(RecordingError, match=r"rgb\.txt and depth\.txt are missing"):
+        open_recording(tmp_path)
+    packed = tmp_path / "drive.bag.gz"
+    packed.write_bytes(b"packed")
+    with pytest.raises(RecordingError, match="unpack it first"):
+        open_recording(packed)
+
+
 def test_folders_are_recognised_by_what_they_hold(tmp_path: Path, tiny: Any) -> None:
     assert isinstance(open_recording(tiny.write_kitti(tmp_path / "a")), KittiSource)
     (tmp_path / "a" / "calib.txt").unlink()

@@ -9,7 +9,7 @@ import numpy as np
 from gvo.diagnostics.check.findings import Finding
 from gvo.diagnostics.check.limits import judged, measured, unknown
 from gvo.io.bag.messages import bare
-from gvo.io.poses.tf import TfBuffer
+from gvo.io.poses.tf import TfBuffer, describe_parents
 from gvo.io.poses.truth import TRUTH_FRAMES
 from gvo.types import Failure, IntArray
 
@@ -31,7 +31,8 @@ def check_frame_tree(
         yield Finding(name="tf: frames", value=", ".join(sorted(buffer.frames)) or "none")
         return
     roots = {parent for parent, _ in edges} - {child for _, child in edges}
-    yield _check_trees(len(frames), roots)
+    parents = describe_parents(edges)
+    yield _check_trees(len(frames), roots, parents)
     camera, base_frame = bare(camera_frame), bare(base_frame)
     if not camera:
         yield unknown("tf: camera", "the images name no frame")
@@ -45,26 +46,26 @@ def check_frame_tree(
             fix=f"record /tf_static, or publish where {camera} is on the robot",
         )
         return
-    yield _check_base(buffer, camera, base_frame)
+    yield _check_base(buffer, camera, base_frame, parents)
     root = next((root for root in sorted(roots) if buffer.chain(root, camera)), None)
     if root is not None and root != camera:
         yield from _check_gaps(buffer.edge_stamps_ns(root, camera), root, camera, stamps_ns)
 
 
-def _check_trees(n_frames: int, roots: Collection[str]) -> Finding:
+def _check_trees(n_frames: int, roots: Collection[str], parents: str) -> Finding:
     names = sorted(roots)
     more = ", ..." if len(names) > _N_NAMED else ""
     return judged(
         "tf: frames",
         f"{n_frames} in {len(names)} tree{'s' if len(names) != 1 else ''}"
         f" (root {', '.join(names[:_N_NAMED])}{more})",
-        is_ok=len(names) <= 1,
+        is_ok=len(names) <= 1 and not parents,
         threshold="1 tree",
-        fix="a transform between the trees is missing: record /tf_static as well",
+        fix=parents or "a transform between the trees is missing: record /tf_static as well",
     )
 
 
-def _check_base(buffer: TfBuffer, camera: str, base_frame: str) -> Finding:
+def _check_base(buffer: TfBuffer, camera: str, base_frame: str, parents: str) -> Finding:
     name = "tf: camera"
     if base_frame not in buffer.frames:
         return Finding(name=name, value=f"{camera} is in the tree, there is no {base_frame}")
@@ -76,7 +77,7 @@ def _check_base(buffer: TfBuffer, camera: str, base_frame: str) -> Finding:
         else " - ".join(chain),
         is_ok=not isinstance(chain, Failure),
         threshold=f"connected to {base_frame}",
-        fix="record /tf_static, or give the camera's pose on the robot in a file",
+        fix=parents or "record /tf_static, or give the camera's pose on the robot in a file",
     )
 
 

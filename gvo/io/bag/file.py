@@ -24,7 +24,7 @@ from rosbags.rosbag1 import ReaderError as ReaderError1
 from rosbags.rosbag1.reader import decompressors
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2 import ReaderError as ReaderError2
-from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
+from rosbags.rosbag2.storage_mcap import DECOMPRESSORS, McapReader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.serde import SerdeError
 
@@ -35,6 +35,7 @@ from gvo.io.bag.recovery.ros1 import Ros1Scan
 from gvo.io.bag.recovery.scan import Channel, FoundMessage, Scan, standard_type
 
 _Reader: TypeAlias = Reader1 | Reader2
+_NO_SCHEMA = "__schemaless__"  # as rosbags calls the type of a channel whose schema it did not see
 _SCANS: dict[str, type[Scan]] = {".bag": Ros1Scan, ".mcap": McapScan}
 _MAGICS = {
     ".bag": (Ros1Scan.magic, "a ROS 1 bag"),
@@ -185,6 +186,11 @@ def _counts(reader: _Reader) -> dict[Channel, int]:
     counts: Counter[Channel] = Counter()
     for connection in reader.connections:
         counts[_channel(connection, reader)] += connection.msgcount
+    if isinstance(reader, Reader2) and isinstance(reader.storage, McapReader):
+        n_known = sum(n for channel, n in counts.items() if channel.type != _NO_SCHEMA)
+        # without statistics and message indexes rosbags counts nothing
+        if n_known < (reader.message_count or len(reader.storage.chunks)):
+            raise DamageError("its summary lacks channels, schemas or counts")
     return counts
 
 

@@ -120,10 +120,11 @@ def stored_pixels(image: RawImage, encoding: Encoding, where: str) -> NDArray[An
         raise RecordingError(f"{where}: the image has no pixels ({width}x{height})")
     rows, is_odd = divmod(height * encoding.rows_per_two, 2)
     row_bytes = width * pixel_bytes
+    step = step or row_bytes  # some drivers leave it 0, and pack the rows
     if is_odd or step < row_bytes or n_bytes != step * rows:
         raise RecordingError(
-            f"{where}: a {image.encoding} image of {width}x{height} with rows of {step} bytes "
-            f"needs {max(step, row_bytes) * rows} bytes, got {n_bytes}"
+            f"{where}: a {image.encoding} image of {width}x{height} with rows of {image.step} "
+            f"bytes needs {max(step, row_bytes) * rows} bytes, got {n_bytes}"
         )
     shape = (rows, width, encoding.n_channels)
     data = np.ascontiguousarray(image.data).data

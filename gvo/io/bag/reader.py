@@ -121,9 +121,7 @@ class BagReader:
             raise ValueError("expected at least one path of a bag")
         for path in paths:
             with named_faults(RecordingError, path):
-                self._files += (
-                    self._open_folder(path) if path.is_dir() else [BagFile(self._unpacked(path))]
-                )
+                self._files += self._open_folder(path) if path.is_dir() else [self._opened(path)]
         self._are_loose = self.is_found or len(paths) > 1
         self.notes += [file.note for file in self._files if file.note]
         self.topics = _merge_topics(self._files)
@@ -176,7 +174,7 @@ class BagReader:
         refusals: list[RecordingError] = []
         for path in found.paths:
             try:
-                files.append(BagFile(self._unpacked(path)))
+                files.append(self._opened(path))
             except RecordingError as error:
                 refusals.append(error)
         if not files:
@@ -184,15 +182,19 @@ class BagReader:
         self._missing += [str(error) for error in refusals]
         return files
 
-    def _unpacked(self, path: Path) -> Path:
+    def _opened(self, path: Path) -> BagFile:
         if path.suffix != _COMPRESSED:
-            return path
+            return BagFile(path)
         folder = Path(tempfile.mkdtemp(prefix="bag-"))
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         unpacked, damage = unpack(path, folder)
+        try:
+            file = BagFile(unpacked)
+        except RecordingError as error:
+            raise RecordingError(damage or str(error).replace(str(unpacked), str(path))) from error
         self._origins[unpacked] = path
         self._missing += [damage] if damage else []
-        return unpacked
+        return file
 
 
 def _begin(file: BagFile, names: Collection[str]) -> Iterator[tuple[int, FoundMessage | None]]:

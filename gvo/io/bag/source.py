@@ -50,6 +50,7 @@ CAMERA_CHANGED = (
 )
 """What follows where a `CameraInfo` changes on the way, and what to do."""
 _N_LISTED = 12
+_LATEST_NS = 2**63 - 1  # in MCAP it may be later
 
 
 class BagSource:
@@ -234,7 +235,7 @@ class BagSource:
             raise RecordingError(f"{error}; {self._reader.damage}") from error
 
     def _stamped(self, message: BagMessage, stream: int) -> StampedImage:
-        log_time_ns = message.log_time_ns
+        log_time_ns = min(message.log_time_ns, _LATEST_NS)
         try:
             content = message.decode()
         except RecordingError as error:
@@ -243,6 +244,9 @@ class BagSource:
         else:
             stamp_ns = log_time_ns if self._takes_log_time else stamp_of(content.header)
             load = partial(self._decoder(message.topic, stream), content)
+        if log_time_ns != message.log_time_ns:
+            reason = f"{message.topic.name}: recorded at {message.log_time_ns} ns, which is no time"
+            load = partial(_fail, reason)
         return StampedImage(stream=stream, stamp_ns=stamp_ns, load=load, log_time_ns=log_time_ns)
 
     def _decoder(self, topic: Topic, stream: int) -> Callable[[Any], NDArray[Any]]:

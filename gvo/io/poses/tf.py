@@ -79,10 +79,8 @@ class TfBuffer:
             notes.append(
                 f"tf: {list_names(both)} published as static and as moving; the moving edge is used"
             )
-        changing = self._changing(self._moving)
-        if changing:
-            notes.append(f"tf: the parent of {list_names(changing)} changes over time")
-        return notes
+        found = describe_parents(self.edges)
+        return [*notes, f"tf: {found}"] if found else notes
 
     def add_message(self, message: Any, *, is_static: bool = False) -> None:  # noqa: ANN401
         """Add a `geometry_msgs/TransformStamped`, in any order of stamps; count an invalid one.
@@ -274,7 +272,8 @@ class TfBuffer:
         stamps_ns = np.array([stamp_ns], dtype=np.int64)
         ((path, _),) = self._paths(target, source, stamps_ns)
         if isinstance(path, Failure):
-            return path
+            found = describe_parents(self.edges, _ancestors(self.edges, (target, source)))
+            return Failure(reason=f"{path.reason}; {found}") if found else path
         edge = next(c for c in path.children if not self._climb((c,), stamps_ns)[1][0])
         samples = self._moving[edge].samples()
         first_ns, last_ns = samples.stamps_ns[[0, -1]]
@@ -421,6 +420,22 @@ def _ancestors(edges: Iterable[tuple[str, str]], frames: Iterable[str]) -> set[s
         found |= ahead
         ahead = {parent for child in ahead for parent in parents.get(child, ())} - found
     return found
+
+
+def describe_parents(
+    edges: Iterable[tuple[str, str]], children: Collection[str] | None = None
+) -> str:
+    """Name the frames, all or some, with more than one parent by edges (parent, child)."""
+    parents: dict[str, list[str]] = {}
+    for parent, child in sorted(edges):
+        parents.setdefault(child, []).append(parent)
+    found = {
+        child: names
+        for child, names in parents.items()
+        if len(names) > 1 and (children is None or child in children)
+    }
+    said = [f"{child} has the parents {' and '.join(names)}" for child, names in found.items()]
+    return f"{list_names(said)}: publish one of them, a frame has one parent" if said else ""
 
 
 def _describe_unknown(name: str, frames: tuple[str, ...]) -> str:

@@ -55,6 +55,16 @@ def test_a_camera_without_transforms_or_without_a_base_is_found() -> None:
     assert findings["tf: camera"].value == "camera_optical is not connected to base_link"
 
 
+def test_a_frame_with_two_parents_is_named_with_both() -> None:
+    buffer = tree()
+    for parent in ("tower", "odom"):
+        add_transform(buffer, parent, "camera_link", 0, np.eye(4), is_static=True)
+        findings = look(buffer)
+        assert "camera_link has the parents base_link and" in findings["tf: frames"].fix
+        assert ("tf: camera" in complaints(findings)) == (parent == "tower")
+    assert "missing" not in findings["tf: frames"].fix
+
+
 def test_gaps_and_an_early_end_of_the_transforms_are_found() -> None:
     sparse = STAMPS_NS[(STAMPS_NS < 4 * S) | (STAMPS_NS > 6 * S)]
     for stamps_ns, fault, value in ((sparse, "gaps", 2.2), (STAMPS_NS[:50], "images outside", 50)):

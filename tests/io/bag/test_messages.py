@@ -149,6 +149,7 @@ def test_depth_is_counts_or_metres(tiny: Any, is_bigendian: bool) -> None:
         ({"height": 2**31}, "needs"),
         ({"step": 1}, "needs"),
         ({"step": 2**31}, "needs"),
+        ({"step": 0, "data": np.zeros(5, np.uint8)}, "rows of 0 bytes .* got 5"),
         ({"data": np.zeros(5, np.uint8)}, "got 5"),
         ({"data": np.zeros(0, np.uint8)}, "got 0"),
     ],
@@ -161,6 +162,14 @@ def test_an_image_whose_header_does_not_fit_its_data_is_refused(
         setattr(message, name, value)
     with pytest.raises(RecordingError, match=f"/image: .*{text}"):
         decode_grey_or_color(message, "/image")
+
+
+@pytest.mark.parametrize("encoding", ["mono8", "rgb8"])
+def test_rows_are_packed_where_a_driver_leaves_the_step_zero(tiny: Any, encoding: str) -> None:
+    message = _message(tiny.texture(1, is_color=encoding == "rgb8"), encoding)
+    expected = decode_grey_or_color(message, "/image")
+    message.step = 0
+    np.testing.assert_array_equal(decode_grey_or_color(message, "/image"), expected)
 
 
 def _compressed(pixels: NDArray[Any], format_: str, suffix: str = ".png") -> Any:

@@ -1,16 +1,19 @@
 """Bags of all kinds, good and broken, read by topic."""
 
 from collections.abc import Callable, Iterable
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import IndexType, Writer
 
 from gvo.errors import RecordingError
-from gvo.io.bag.reader import BagReader
+from gvo.io.bag.reader import BagReader, serialize
 from gvo.io.bag.topics import IMAGE_TYPE
 from tests.make.bags import Message, image, write
 
@@ -132,6 +135,42 @@ def test_a_file_of_a_folder_that_is_empty_is_told(tmp_path: Path) -> None:
         (folder / f"part_{n}.db3").write_bytes(b"")
     with pytest.raises(RecordingError, match="the file is empty"):
         BagReader(folder)
+
+
+@pytest.mark.parametrize("name", ["a.db3", "a.mcap"])
+def test_a_compressed_file_that_ends_early_is_told_by_its_own_name(
+    tmp_path: Path, name: str
+) -> None:
+    file = write(tmp_path / name, _images("/a", range(_N), is_ros1=False), compression="FILE")
+    data = file.read_bytes()
+    for cut in (data[: len(data) // 2], b""):
+        file.write_bytes(cut)
+        with pytest.raises(RecordingError) as caught:
+            BagReader(file)
+        assert str(caught.value).startswith(f"{file}: is cut or damaged (its zstd stream ends")
+
+
+_OPTIONS = ("use_chunking", "repeat_channels", "repeat_schemas", "use_statistics")
+
+
+@pytest.mark.parametrize("kinds", [IndexType.NONE, IndexType.CHUNK, IndexType.ALL])
+def test_a_summary_of_mcap_may_lack_anything(tmp_path: Path, kinds: IndexType) -> None:
+    for values in product([False, True], repeat=len(_OPTIONS)):
+        path = tmp_path / "a.mcap"
+        with path.open("wb") as file:
+            options: Any = dict(zip(_OPTIONS, values, strict=True))
+            writer: Any = Writer(file, index_types=kinds, **options)
+            writer.start(profile="ros2")
+            schema = writer.register_schema(IMAGE_TYPE, "ros2msg", b"")
+            channel = writer.register_channel("/a", "cdr", schema)
+            for n, (_, _, _, message) in enumerate(_images("/a", range(_N), is_ros1=False)):
+                data = serialize(message, IMAGE_TYPE, is_ros1=False)
+                writer.add_message(channel, n, data, publish_time=n)
+            writer.finish()
+        reader = BagReader(path)
+        assert [(t.name, t.type, t.n_messages) for t in reader.topics] == [("/a", IMAGE_TYPE, _N)]
+        assert len([message.decode() for message in reader.messages(["/a"])]) == _N
+        assert reader.damage == ""
 
 
 def test_a_file_that_the_metadata_do_not_name_is_left_out(tmp_path: Path) -> None:

@@ -1,8 +1,9 @@
 """Bags as recordings."""
 
+from array import array
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -84,6 +85,23 @@ def test_each_faulty_image_is_one_faulty_frame(tmp_path: Path, tiny: Any) -> Non
     ):
         assert word in reason
         assert reason.startswith("left image: ")
+
+
+@pytest.mark.parametrize("stamps", ["header", "recording"])
+def test_an_image_recorded_at_no_time_is_a_faulty_frame(
+    tmp_path: Path, tiny: Any, stamps: Literal["header", "recording"]
+) -> None:
+    messages = _stereo(tiny, is_ros1=False)
+    for n, message in enumerate(messages):
+        if message[1] == IMAGE_TYPE and message[2] == 2:
+            messages[n] = (*message[:2], 2**63 + 2, message[3])
+    source = BagSource(write(tmp_path / "a.mcap", messages))
+    config = Config.model_validate({"sync": {"stamps": stamps}})
+    read = list(frames(BagSource(tmp_path / "a" / "a.mcap", config=config), config))
+    assert [type(item) for item in read] == [StereoFrame] * 2 + [FaultyFrame]
+    assert "is no time" in getattr(read[2], "reason", "")
+    # as what looks through a recording before a run keeps them
+    assert len(array("q", [image.log_time_ns or 0 for image in source.images()])) == 6
 
 
 def test_a_calibration_file_replaces_camera_info(tmp_path: Path, tiny: Any) -> None:

@@ -193,8 +193,17 @@ def test_a_child_that_changes_its_parent_is_followed() -> None:
     np.testing.assert_allclose(T[:2, 0, 3], [145.0, 1.5])
     assert buffer.chain("a", "cup") == ("a", "hand", "cup")
     assert buffer.edge_stamps_ns("a", "cup").tolist() == [n * 10**9 for n in (1, 2, 4, 5)]
-    assert "cup changes" in " ".join(buffer.notes)
+    assert "cup has the parents a and hand" in " ".join(buffer.notes)
     assert buffer.lookup_many("a", "cup", np.empty(0, dtype=np.int64))[0].shape == (0, 4, 4)
+
+
+def test_where_a_second_parent_tears_the_tree_it_is_named() -> None:
+    buffer = moving(1.0)
+    for parent in ("b", "tower"):
+        add_transform(buffer, parent, "eye", 0, shift(1.0), is_static=True)
+    reason = reason_of(buffer.lookup("a", "eye", 10**9))
+    assert "that of eye at tower; eye has the parents b and tower" in reason
+    assert "parents" not in reason_of(buffer.lookup("a", "b", 10**10))
 
 
 def test_a_child_both_static_and_moving_moves() -> None:

@@ -94,7 +94,7 @@ def inflate_file(source: Path, target: Path) -> str:
                 piece = decompressor.unused_data if is_whole else b""
                 if is_whole:
                     decompressor = zstd.ZstdDecompressor()
-    return "" if is_whole else "its end is missing"
+    return "" if is_whole else "its zstd stream ends early"
 
 
 def _feed(decompressor: Any, compression: str, piece: bytes, limit: int) -> bytes:  # noqa: ANN401
