@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/ that show what `gvo` shows, from the rendered drive of `gvo demo`.
+"""Draw the pictures of docs/ that show what `gvo` shows, from a rendered drive.
 
 The page of `gvo view` needs chromium and selenium, and is left out with a message without them.
 
@@ -28,7 +28,6 @@ from gvo.diagnostics.explain import explain_frame
 from gvo.errors import GvoError, RecordingError
 from gvo.io.run_folder.reader import read_run
 from gvo.odometry.odometry import Odometry
-from gvo.runs.demo import BAG_NAME, write_demo_bags
 from gvo.runs.outputs.options import RunOutputs
 from gvo.types import Frame
 from gvo.viz.explanation.pictures import draw_pictures
@@ -90,9 +89,9 @@ def main() -> None:
         parser.error("--frame must be at least 1: the first frame has no matches")
     arguments.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as name:
-        bag = arguments.recording or Path(name) / BAG_NAME
+        bag = arguments.recording or Path(name) / "drive.mcap"
         if arguments.recording is None:
-            write_demo_bags(Path(name))
+            gvo.convert(gvo.SyntheticRecording("driving", "stereo"), bag)
         task = Task(bag, arguments.frame, Path(name))
         for kind in arguments.only or PICTURES:
             picture = PICTURES[kind](task)

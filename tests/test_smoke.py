@@ -15,7 +15,8 @@ def test_the_demo_its_comparison_and_its_smoothing(
     out = tmp_path / "gvo-demo"
     monkeypatch.setattr("gvo.runs.demo.N_FRAMES", 4)
     assert command("demo", "--out", out).code == 0
-    check_place(out)  # it may be made anew
+    check_place(out, force=True)  # it may be made anew
+    assert command("demo", "--out", out).code == 2
     assert {"drive.mcap", "robot.mcap", "summary.json", "report.html", "trajectories.png"} <= {
         path.name for path in out.iterdir()
     }

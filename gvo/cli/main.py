@@ -79,16 +79,18 @@ def _options(
 @_command()
 def demo(
     out: Annotated[Path, Option(metavar="DIR", help="Folder to write.")] = Path("gvo-demo"),
+    force: opt.Force = False,
 ) -> None:
     """Render a drive as a bag, run on it, compare with the truth."""
     from gvo.runs.demo import BAG_NAME, check_place, run_demo
 
-    check_place(out)
+    check_place(out, force=force)
     say(f"rendering a drive into {out / BAG_NAME}")
-    stands = f"what is done is in {out}; the same command begins anew"
+    stands = f"what is done is in {out}; --force begins anew"
     with Work(stands) as work, progress("demo") as show:
         result = run_demo(
             out,
+            force=force,
             on_rendered=work.check,
             on_progress=work.checking(show),
             on_written=work.note_written,

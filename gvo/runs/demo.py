@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-import filecmp
 import logging
+import multiprocessing
+import os
+import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -16,18 +22,19 @@ from gvo.errors import RecordingError, write_faults
 from gvo.io.convert.bag_messages import BagWriter, FramePose, write_transforms
 from gvo.io.convert.convert import convert
 from gvo.io.opening import open_recording
+from gvo.io.recording import RecordingInfo, StampedImage
 from gvo.io.run_folder.line_file import check_new
 from gvo.io.run_folder.writer import check_unused
 from gvo.io.synthetic import SyntheticRecording
 from gvo.runs.result import RunResult
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Progress
+from gvo.types import ImageArray, Progress
 
 _LOGGER = logging.getLogger(__name__)
 
 BAG_NAME = "drive.mcap"
 ROBOT_NAME = "robot.mcap"
-N_FRAMES = 100
+N_FRAMES = 450  # the lap closes after 370
 
 # The camera looks ahead, 0.5 m in front of the robot's middle and 1.2 m high: x forward, z up.
 _T_BASE_CAM = np.array([[0.0, 0, 1, 0.5], [-1, 0, 0, 0.1], [0, -1, 0, 1.2], [0, 0, 0, 1]])
@@ -50,17 +57,69 @@ def write_demo_bags(folder: Path, *, progress: Callable[[int], None] | None = No
     RecordingError
         When a file cannot be written.
     """
-    drive = _drive()
+    drive = _drive(N_FRAMES)
     with write_faults(RecordingError, folder):
         folder.mkdir(parents=True, exist_ok=True)
         for name in (BAG_NAME, ROBOT_NAME):
             (folder / name).unlink(missing_ok=True)
         write_robot_bag(drive.ground_truth(), folder / ROBOT_NAME)
-    convert(drive, folder / BAG_NAME, progress=progress)
+    with _processes() as pool:
+        convert(_RenderedAhead(drive, pool), folder / BAG_NAME, progress=progress)
 
 
-def _drive() -> SyntheticRecording:
-    return SyntheticRecording(world="driving", sensor="stereo", n_frames=N_FRAMES)
+@lru_cache(maxsize=1)
+def _drive(n_frames: int) -> SyntheticRecording:
+    return SyntheticRecording("block", "stereo", n_frames=n_frames, scale=0.5)
+
+
+@lru_cache(maxsize=1)
+def _images(n_frames: int) -> list[StampedImage]:
+    return list(_drive(n_frames).images())
+
+
+def _render(n_frames: int, index: int) -> ImageArray:
+    return np.asarray(_images(n_frames)[index].load())
+
+
+class _RenderedAhead:
+    """The drive, its images rendered by other processes before they are asked for."""
+
+    def __init__(self, drive: SyntheticRecording, pool: Executor) -> None:
+        self._drive, self._pool = drive, pool
+
+    @property
+    def info(self) -> RecordingInfo:
+        return self._drive.info
+
+    def images(self) -> Iterator[StampedImage]:
+        images = list(self._drive.images())
+        render = partial(_render, len(images) // 2)
+        rendered = self._pool.map(render, range(len(images)), chunksize=4)
+        for image, pixels in zip(images, rendered, strict=True):
+            yield replace(image, load=partial(np.asarray, pixels))
+
+    def ground_truth(self) -> Trajectory:
+        return self._drive.ground_truth()
+
+
+@contextmanager
+def _processes() -> Iterator[Executor]:
+    """Yield workers on all cores; an error or an interrupt stops them at once."""
+    pool = ProcessPoolExecutor(
+        max_workers=os.cpu_count(),
+        mp_context=multiprocessing.get_context("spawn"),
+        # The first process alone answers to Ctrl-C.
+        initializer=signal.signal,
+        initargs=(signal.SIGINT, signal.SIG_IGN),
+    )
+    try:
+        yield pool
+    except BaseException:
+        for worker in multiprocessing.active_children():
+            worker.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def write_robot_bag(truth: Trajectory, path: Path) -> None:
@@ -76,28 +135,23 @@ def write_robot_bag(truth: Trajectory, path: Path) -> None:
         bag.result.rename(path)
 
 
-def check_place(out: Path) -> None:
-    """Refuse a folder that holds something else, before any work.
-
-    That of an earlier demonstration is known by its `robot.mcap`, equal to the bit.
+def check_place(out: Path, *, force: bool = False) -> None:
+    """Refuse a folder that holds a result or a recording of these names, unless forced.
 
     Raises
     ------
-    RecordingError
+    RecordingError, OutputError
         With what to do.
     """
-    with TemporaryDirectory() as fresh:
-        robot, there = Path(fresh) / ROBOT_NAME, out / ROBOT_NAME
-        write_robot_bag(_drive().ground_truth(), robot)
-        is_own = there.is_file() and filecmp.cmp(robot, there, shallow=False)
-    check_unused(out, force=is_own, can_force=False)
-    for name in () if is_own else (BAG_NAME, ROBOT_NAME):
-        check_new(out / name)
+    check_unused(out, force=force)
+    for name in () if force else (BAG_NAME, ROBOT_NAME):
+        check_new(out / name, otherwise="--force to replace it")
 
 
 def run_demo(
     out: Path,
     *,
+    force: bool = False,
     on_rendered: Callable[[int], None] | None = None,
     on_progress: Callable[[Progress], None] | None = None,
     on_written: Callable[[], None] | None = None,
@@ -107,7 +161,9 @@ def run_demo(
     Parameters
     ----------
     out : Path
-        Folder for the bags and the run's files. That of an earlier demonstration is made anew.
+        Folder for the bags and the run's files.
+    force : bool
+        Let earlier ones be replaced.
     on_rendered : callable, optional
         Called with the number of images written to the bag so far.
     on_progress, on_written : callable, optional
@@ -118,7 +174,7 @@ def run_demo(
     RecordingError
         When the folder holds something else of these names, or cannot be written.
     """
-    check_place(out)
+    check_place(out, force=force)
     # Kernels are compiled, once on a machine, while the drive is rendered.
     command = [sys.executable, "-m", "gvo.kernels"]
     with subprocess.Popen(command, stderr=subprocess.DEVNULL) as compiler:  # noqa: S603

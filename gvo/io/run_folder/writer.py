@@ -81,7 +81,7 @@ def free_path(path: Path) -> Path:
     return next(each for each in chain([path], numbered) if not os.path.lexists(each))
 
 
-def check_unused(folder: Path, *, force: bool = False, can_force: bool = True) -> None:
+def check_unused(folder: Path, *, force: bool = False) -> None:
     """Refuse a folder that cannot be written, or holds an earlier result; nothing is made.
 
     Parameters
@@ -89,8 +89,6 @@ def check_unused(folder: Path, *, force: bool = False, can_force: bool = True) -
     folder : Path
     force : bool
         Let them be replaced.
-    can_force : bool
-        Name `--force` as a way out.
 
     Raises
     ------
@@ -101,8 +99,8 @@ def check_unused(folder: Path, *, force: bool = False, can_force: bool = True) -
     there = [name for name in _RESULTS if os.path.lexists(folder / name)]
     if there and not force:
         raise OutputError(
-            f"{folder}: holds an earlier result ({there[0]}); give another folder by --out"
-            f"{', or --force to replace it' if can_force else ''}"
+            f"{folder}: holds an earlier result ({there[0]}); give another folder by --out, "
+            "or --force to replace it"
         )
 
 
