@@ -75,7 +75,7 @@ def frames(
     """
     config = config or Config()
     is_live = through is not None
-    pairs = paired(source.images(), source.info.sensor, config.sync, is_prompt=is_live)
+    pairs = paired(source.images(), source.info.sensor, config.sync, is_live=is_live)
     if excerpt is not None:
         pairs = take_excerpt(pairs, excerpt)
     preparers = make_preparers(source.info)
@@ -105,7 +105,7 @@ def paired(
     sync: SyncConfig,
     *,
     limit_ms: float | None = None,
-    is_prompt: bool = False,
+    is_live: bool = False,
 ) -> Iterator[Paired]:
     """Pair the images of a recording as configured, or within a given limit; see `pair_images`."""
     key = pair_limit_key(sensor)
@@ -115,7 +115,7 @@ def paired(
         stamps.images(),
         limit_ns=round(limit * 1e6),
         partner=f"{'right' if sensor == 'stereo' else 'depth'} image within sync.{key}",
-        is_prompt=is_prompt,
+        is_live=is_live,
     )
     for item in pairs:
         yield from stamps.take_faulty()

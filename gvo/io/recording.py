@@ -34,12 +34,15 @@ class StampedImage:
         metres (h, w), NaN = unknown. Raises `RecordingError` where the image is faulty.
     log_time_ns : int, optional
         When it was recorded, by the recording's own clock; None where there is no such clock.
+    n_bytes : int
+        Memory that it holds until it is loaded, where that is known.
     """
 
     stream: int
     stamp_ns: int
     load: Callable[[], NDArray[Any]]
     log_time_ns: int | None = None
+    n_bytes: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

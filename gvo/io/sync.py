@@ -6,6 +6,7 @@ import heapq
 import math
 from collections import deque
 from collections.abc import Iterable, Iterator
+from itertools import chain
 from typing import TypeAlias
 
 from gvo.errors import GvoError
@@ -27,6 +28,8 @@ _SHORTEST = 0.8
 # partners may still come, and how much nearer, as a share, a later partner must be to be preferred
 # to an earlier one: as message_filters has them by default.
 _QUEUE_SIZE = 100
+# Of a running camera, their memory has a bound as well.
+MAX_WAITING_BYTES = 512_000_000
 _AGE_PENALTY = 0.1
 
 
@@ -35,7 +38,7 @@ def pair_images(
     *,
     limit_ns: int,
     partner: str,
-    is_prompt: bool = False,
+    is_live: bool = False,
 ) -> Iterator[Paired]:
     """Pair the images of stream 0 with those of stream 1, as message_filters of ROS does.
 
@@ -52,10 +55,11 @@ def pair_images(
         Largest difference of the stamps of a pair, nanoseconds; 0: equal stamps.
     partner : str
         What stream 1 is called in messages, with the parameter that sets the limit.
-    is_prompt : bool
-        Give an approximate pair out as soon as the period of the images says that no better
-        partner can come, not with the next image. The pairs are the same, unless a camera
-        suddenly sends faster than ever before.
+    is_live : bool
+        The images come from a running camera. An approximate pair is given out as soon as the
+        period of the images says that no better partner can come, not with the next image: the
+        pairs are the same, unless a camera suddenly sends faster than ever before. Images that
+        wait for a partner take at most 512 MB, and a negative stamp makes no frame.
 
     Yields
     ------
@@ -81,10 +85,10 @@ def pair_images(
     ----------
     .. [1] http://wiki.ros.org/message_filters/ApproximateTime
     """
-    answers = _Answers(limit_ns, partner)
+    answers = _Answers(limit_ns, partner, is_live=is_live)
     policy: _ExactTime | _ApproximateTime = _ExactTime(answers)
     if limit_ns > 0:
-        policy = _ApproximateTime(limit_ns, answers, is_prompt=is_prompt)
+        policy = _ApproximateTime(limit_ns, answers, is_live=is_live)
     try:
         for image in images:
             policy.push(image)
@@ -100,11 +104,12 @@ def pair_images(
 class _Answers:
     """Pairs and faulty frames, one for each image of stream 0, in the order of stamps."""
 
-    def __init__(self, limit_ns: int, partner: str) -> None:
+    def __init__(self, limit_ns: int, partner: str, *, is_live: bool) -> None:
         self._limit_ns, self._partner = limit_ns, partner
+        self._max_bytes = MAX_WAITING_BYTES if is_live else math.inf
         self._ready: list[Paired] = []
         self._passed_ns: int | None = None  # the last stamp of stream 1 that was dealt with
-        self.last_ns: int | None = None  # of the last pair
+        self.last_ns: int | None = -1 if is_live else None  # of the last pair
 
     def take(self) -> list[Paired]:
         """Return the answers since the last call."""
@@ -119,11 +124,18 @@ class _Answers:
             self.last_ns = image.stamp_ns
             self._ready.append((image, partner))
 
+    def is_crowded(self, n_waiting: int, images: Iterable[StampedImage | None]) -> bool:
+        """Tell whether more wait than may, by their number or by their memory."""
+        n_bytes = sum(0 if image is None else image.n_bytes for image in images)
+        return n_waiting > _QUEUE_SIZE or n_bytes > self._max_bytes
+
     def is_late(self, image: StampedImage) -> bool:
         return self.last_ns is not None and image.stamp_ns <= self.last_ns
 
     def add_late(self, image: StampedImage) -> None:
-        if self.last_ns is not None and image.stamp_ns < self.last_ns:
+        if self.last_ns == -1 and image.stamp_ns < 0:
+            reason = f"the stamp {image.stamp_ns} ns is negative"
+        elif self.last_ns is not None and image.stamp_ns < self.last_ns:
             reason = f"the stamp goes back from {self.last_ns} to {image.stamp_ns} ns"
         else:
             reason = f"the stamp {image.stamp_ns} ns repeats"
@@ -140,7 +152,7 @@ class _Answers:
         gaps = [abs(stamp_ns - image.stamp_ns) for stamp_ns in around]
         nearest = f"the nearest is {min(gaps) / 1e6:g} ms away" if gaps else "there is none"
         if is_crowded:
-            nearest += f", and {_QUEUE_SIZE} images wait already"
+            nearest += f", and {_QUEUE_SIZE} images, or 512 MB, wait already"
         elif gaps and min(gaps) <= self._limit_ns:
             nearest += " and belongs to another image"
         reason = f"no {self._partner}={self._limit_ns / 1e6:g}: {nearest}"
@@ -169,7 +181,9 @@ class _ExactTime:
             self._waiting[image.stamp_ns] = [None, None]
             heapq.heappush(self._stamps, image.stamp_ns)
         self._store(image)
-        if len(self._waiting) > _QUEUE_SIZE:
+        while self._answers.is_crowded(
+            len(self._waiting), chain.from_iterable(self._waiting.values())
+        ):
             self._leave_oldest(is_crowded=True)
 
     def end(self) -> None:
@@ -210,8 +224,8 @@ class _ApproximateTime:
     other stream up to the first one after it.
     """
 
-    def __init__(self, limit_ns: int, answers: _Answers, *, is_prompt: bool) -> None:
-        self._periods = (_Period(), _Period()) if is_prompt else None
+    def __init__(self, limit_ns: int, answers: _Answers, *, is_live: bool) -> None:
+        self._periods = (_Period(), _Period()) if is_live else None
         self._limit_ns, self._answers = limit_ns, answers
         self._queues: tuple[deque[StampedImage], deque[StampedImage]] = (deque(), deque())
         # Where images were given up, one of them might have suited a pivot better than what is
@@ -227,7 +241,7 @@ class _ApproximateTime:
         if self._periods is not None:
             self._periods[image.stream].add(image.stamp_ns)
         self._advance()
-        if len(queue) > _QUEUE_SIZE:
+        while self._answers.is_crowded(len(queue), queue):
             self._pivot = None
             self._leave(image.stream, is_crowded=True)
             self._has_gap[image.stream] = True
@@ -323,6 +337,8 @@ class _Period:
     def add(self, stamp_ns: int) -> None:
         if self._last_ns is not None:
             step_ns = stamp_ns - self._last_ns
+            if step_ns <= 0:  # a stamp gone wrong
+                return
             self._least_ns = step_ns if self._n_known == 0 else min(self._least_ns, step_ns)
             self._n_known += 1
         self._last_ns = stamp_ns

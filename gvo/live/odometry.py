@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
@@ -22,7 +22,7 @@ from gvo.io.bag.messages import transform_of
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import ChosenImages, Source, StampedImage
 from gvo.io.run_folder.writer import free_path
-from gvo.io.sync import Pair, Paired
+from gvo.io.sync import MAX_WAITING_BYTES, Pair, Paired
 from gvo.live.publishing import Arrivals, LiveMessages
 from gvo.live.transport import SET_POSE, TRIGGER, NetworkWriter, Parameters, Service, Sink
 from gvo.odometry.odometry import Odometry
@@ -43,8 +43,13 @@ _MAX_BEFORE_TIED = 300
 # The lag is predicted by the slowest of the last twenty frames.
 _N_TIMED = 20
 _N_WARMING = 3
-# Stamps that go back by more begin a new run: a clock was set, or a bag is played again.
+# Where the stamps of both streams go back by more, in so many images of each, a new run begins: a
+# clock was set, or a bag is played again. Their time so far is the median of the last stamps.
 _BACK_NS = 1_000_000_000
+_N_TO_RESTART = 3
+_N_STAMPS = 5
+# Images of a stream that may wait for the other one to go back too.
+_MAX_HELD = 100
 _PATIENCE_S = 60.0
 
 
@@ -228,7 +233,7 @@ class LiveOdometry:
         if self.viewer is not None:
             self.viewer.begin(loop.window)
             loop.on_tracked = self.viewer.add
-        self._messages = LiveMessages(self._writers, frames, self.arrivals.note_sent)
+        self._messages = LiveMessages(self._writers, frames, self.arrivals.note_sent, self._say)
         return [self._messages]
 
     def _reconfigure(self, config: Config) -> None:
@@ -281,7 +286,9 @@ class LiveOdometry:
 class Stretches:
     """Splits a stream of images into runs: where stamps go back, and after `cut`.
 
-    Two images in a row must be more than a second behind; a single one is only late.
+    Each stream is compared with itself, so that one may come later than the other. Three images of
+    each in a row must be more than a second behind; fewer have a wrong stamp, and pairing skips
+    them.
 
     Attributes
     ----------
@@ -293,7 +300,7 @@ class Stretches:
 
     def __init__(self, images: Iterator[StampedImage]) -> None:
         self._images = images
-        self._held: deque[StampedImage] = deque()
+        self._next_images: deque[StampedImage] = deque()  # of the next stretch
         self._is_cut = False
         self.is_ended = False
         self.reason = ""
@@ -304,33 +311,65 @@ class Stretches:
 
     def next_stretch(self) -> Iterator[StampedImage]:
         """Yield images until the stretch ends."""
-        newest_ns: int | None = None
-        late: list[StampedImage] = []
+        streams = _StreamTime(), _StreamTime()
         self._is_cut = False
         while (image := self._next()) is not None:
-            is_back = newest_ns is not None and image.stamp_ns < newest_ns - _BACK_NS
-            if self._is_cut or (is_back and late):
-                self._held.extend([*late, image])
-                back = f"the stamps go back to {image.stamp_ns} ns"
-                self.reason = "it was reset" if self._is_cut else back
+            if self._is_cut:
+                self._next_images.append(image)
+                self.reason = "it was reset"
+                break
+            yield from streams[image.stream].take(image)
+            if all(stream.is_back for stream in streams):
+                held = chain.from_iterable(stream.held for stream in streams)
+                self._next_images.extend(sorted(held, key=lambda each: each.stamp_ns))
+                self.reason = f"the stamps go back to {self._next_images[0].stamp_ns} ns"
                 return
-            if is_back:
-                late.append(image)
-                continue
-            newest_ns = image.stamp_ns if newest_ns is None else max(newest_ns, image.stamp_ns)
-            yield from (*late, image)
-            late = []
-        yield from late
-        self.is_ended = True
+        else:
+            self.is_ended = True
+        for stream in streams:
+            yield from stream.held
 
     def _next(self) -> StampedImage | None:
-        if self._held:
-            return self._held.popleft()
+        if self._next_images:
+            return self._next_images.popleft()
         try:
             return next(self._images, None)
         except GvoError:
             self.is_ended = True
             raise
+
+
+class _StreamTime:
+    """The time of one stream, and the images in a row that are behind it."""
+
+    def __init__(self) -> None:
+        self._stamps_ns: deque[int] = deque(maxlen=_N_STAMPS)
+        self.held: deque[StampedImage] = deque()
+
+    @property
+    def is_back(self) -> bool:
+        """Whether enough images in a row are behind."""
+        return len(self.held) >= _N_TO_RESTART
+
+    def take(self, image: StampedImage) -> Iterator[StampedImage]:
+        """Hold an image that is behind; else yield it, after those that were."""
+        if not self._is_behind(image.stamp_ns):
+            yield from self.held
+            self.held.clear()
+            self._stamps_ns.append(image.stamp_ns)
+            yield image
+            return
+        if self.held and image.stamp_ns <= self.held[-1].stamp_ns:
+            yield from self.held  # no time goes on from there
+            self.held.clear()
+        self.held.append(image)
+        n_bytes = sum(each.n_bytes for each in self.held)
+        if len(self.held) > _MAX_HELD or n_bytes > MAX_WAITING_BYTES // 2:
+            yield self.held.popleft()
+
+    def _is_behind(self, stamp_ns: int) -> bool:
+        n = len(self._stamps_ns)
+        return n > 0 and stamp_ns < sorted(self._stamps_ns)[(n - 1) // 2] - _BACK_NS
 
 
 def _warm(camera: StereoCamera | PinholeCamera, config: Config) -> None:

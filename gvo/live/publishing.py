@@ -39,6 +39,8 @@ class LiveMessages:
     frames : RunFrames
     on_sent : callable
         Called with the stamp of a frame when its pose was sent.
+    say : callable
+        Gets a line of text when something cannot be sent.
     """
 
     def __init__(
@@ -46,9 +48,10 @@ class LiveMessages:
         writers: Sequence[NetworkWriter],
         frames: RunFrames,
         on_sent: Callable[[int], None] = lambda _: None,
+        say: Callable[[str], None] = lambda _: None,
     ) -> None:
         self._outputs = [RunMessages(writer, frames) for writer in writers]
-        self._on_sent = on_sent
+        self._on_sent, self._say = on_sent, say
         self._T_set_world = np.eye(4)
         self._T_world_base = np.eye(4)
 
@@ -65,27 +68,31 @@ class LiveMessages:
         """Send the result of a frame."""
         self._T_world_base = result.T_map_world @ result.causal.T_world_frame
         placed = self._placed_result(result)
-        for output in self._outputs:
-            output.add_frame(frame, placed)
+        self._give(lambda output: output.add_frame(frame, placed))
         self._on_sent(frame.stamp_ns)
 
     def add_faulty(self, frame: FaultyFrame) -> None:
         """Send the reason why a frame has no pose."""
-        for output in self._outputs:
-            output.add_faulty(frame)
+        self._give(lambda output: output.add_faulty(frame))
 
     def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
         """Send smoothed poses that will not change any more."""
         placed = self._placed(estimates)
-        for output in self._outputs:
-            output.add_smoothed(placed)
+        self._give(lambda output: output.add_smoothed(placed))
 
     def add_optimum(self, optimum: Optimum) -> None:
         """Send the global poses and the whole paths, at the end of a run."""
         placed = replace(optimum, estimates=self._placed(optimum.estimates))
+        self._give(lambda output: output.add_optimum(placed))
+        self._give(lambda output: output.write_paths())
+
+    def _give(self, write: Callable[[RunMessages], None]) -> None:
+        """Send to all networks; what cannot be sent does not silence what follows."""
         for output in self._outputs:
-            output.add_optimum(placed)
-            output.write_paths()
+            try:
+                write(output)
+            except RecordingError as error:
+                self._say(str(error))
 
     def _placed_result(self, result: FrameResult) -> FrameResult:
         T = self._T_set_world
@@ -154,7 +161,7 @@ class Arrivals(AbstractContextManager["Arrivals"]):
         """Yield the images and note when each arrived."""
         for image in images:
             self._times_s[image.stream].append(time.monotonic())
-            self._newest_ns = max(self._newest_ns, image.stamp_ns)
+            self._newest_ns = max(image.stamp_ns, 0)
             yield image
 
     def note_pair(self, stamp_ns: int) -> None:

@@ -129,8 +129,8 @@ def test_what_is_given_early_is_what_would_be_given_late(
         key=lambda image: image.stamp_ns,
     )
     found = []
-    for is_prompt in (False, True):
-        items = pair_images(images, limit_ns=20, partner="depth", is_prompt=is_prompt)
+    for is_live in (False, True):
+        items = pair_images(images, limit_ns=20, partner="depth", is_live=is_live)
         found.append([item for item in items if not isinstance(item, FaultyFrame)])
     assert found[0] == found[1]
 
@@ -145,7 +145,7 @@ def test_a_pair_is_given_with_its_last_image_where_the_period_is_known() -> None
             n_pushed += 1
             yield _image(stream, stamp_ns)
 
-    pairs = pair_images(images(), limit_ns=20, partner="depth", is_prompt=True)
+    pairs = pair_images(images(), limit_ns=20, partner="depth", is_live=True)
     given_after = [n_pushed for _ in pairs]
     assert given_after[:5] == [3, 5, 7, 9, 11]
     assert given_after[12:] == [2 * n for n in range(13, 21)]

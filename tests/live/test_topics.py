@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from gvo.io.bag.messages import stamp_of, transform_of
 from gvo.io.bag.reader import BagMessage, BagReader, serialize, typestore
 from gvo.io.bag.topics import IMAGE_TYPE
 from gvo.io.poses.base_frame import BaseFrame
-from gvo.io.recording import StampedImage
+from gvo.io.recording import ChosenImages, StampedImage
 from gvo.live.odometry import LiveOdometry, LiveRun, Stretches
 from gvo.live.topics import NetworkReader, TopicSource, wait_for
 from gvo.live.transport import Parameters, decode
@@ -357,23 +358,76 @@ def image(stamp_ms: int, stream: int = 0) -> StampedImage:
     return StampedImage(stream=stream, stamp_ns=stamp_ms * 10**6, load=lambda: np.eye(2))
 
 
+def cut(images: list[StampedImage]) -> list[list[int]]:
+    """Return the stamps of both streams in ms, one after the other, by stretch."""
+    stretches, found = Stretches(iter(images)), []
+    while not stretches.is_ended:
+        found.append([each.stamp_ns // 10**6 for each in stretches.next_stretch()])
+    return found
+
+
 @pytest.mark.parametrize(
     ("stamps_ms", "stretches"),
     [
         ([], [[]]),
         ([5000, 5100, 4900, 5200], [[5000, 5100, 4900, 5200]]),
         ([5000, 5100, 0, 5200, 5300], [[5000, 5100, 0, 5200, 5300]]),
+        ([5000, 5100, -1, 0, 5200], [[5000, 5100, -1, 0, 5200]]),
+        ([5000, 5100, 0, 0, 0, 0, 5200], [[5000, 5100, 0, 0, 0, 0, 5200]]),
+        ([5000, 6600, 5100, 5200, 5300, 5400], [[5000, 6600, 5100, 5200, 5300, 5400]]),
+        ([5000, 5100, 0, 100], [[5000, 5100, 0, 100]]),
         ([5000, 5100, 0, 100, 200], [[5000, 5100], [0, 100, 200]]),
-        ([5000, 0], [[5000, 0]]),
-        ([9000, 5000, 5100, 0, 100], [[9000], [5000, 5100], [0, 100]]),
+        ([9000, 5000, 5100, 5200, 0, 9, 99], [[9000], [5000, 5100, 5200], [0, 9, 99]]),
     ],
 )
-def test_images_are_cut_where_two_go_back(stamps_ms: list[int], stretches: list[list[int]]) -> None:
-    images = Stretches(image(stamp) for stamp in stamps_ms)
-    found = []
-    while not images.is_ended:
-        found.append([each.stamp_ns // 10**6 for each in images.next_stretch()])
-    assert found == stretches
+def test_a_run_ends_where_three_of_both_streams_go_back(
+    stamps_ms: list[int], stretches: list[list[int]]
+) -> None:
+    found = cut([image(stamp, stream) for stamp in stamps_ms for stream in (0, 1)])
+    assert [sorted(each) for each in found] == [sorted(2 * each) for each in stretches]
+
+
+def test_a_stream_that_comes_late_or_goes_back_alone_ends_no_run() -> None:
+    late = [image(stamp, 0) for stamp in range(0, 9000, 100)]
+    late += [image(stamp, 1) for stamp in range(0, 9000, 100)]
+    assert cut(late) == [[each.stamp_ns // 10**6 for each in late]]
+    alone = [
+        image(stamp - (stream == 0 and stamp > 5000) * 3000, stream)
+        for stamp in range(0, 30_000, 100)
+        for stream in (0, 1)
+    ]
+    (found,) = cut(alone)
+    assert sorted(found) == sorted(each.stamp_ns // 10**6 for each in alone)
+
+
+@pytest.mark.parametrize("stray_ms", [0, -5, 1500, 10**13])
+def test_a_pair_with_a_wrong_stamp_is_skipped_and_counted(
+    stray_ms: int, drive_bag: Path, tmp_path: Path
+) -> None:
+    source, network, said = gvo.open_recording(drive_bag), Network(), list[str]()
+    images = [*source.images()]
+    ns = stray_ms * 10**6 + (images[0].stamp_ns if stray_ms > 0 else 0)
+    images[8:10] = [replace(each, stamp_ns=ns) for each in images[8:10]]
+    chosen = ChosenImages(info=source.info, images=lambda: iter(images))
+    live = LiveOdometry(chosen, sinks=[network], max_waiting=1000, say=said.append)
+    outputs = gvo.RunOutputs(report=False, bag=tmp_path / "run.mcap")
+    ((_, result),) = live.run(tmp_path / "out", outputs=outputs)
+    assert result.summary["frames"] == N_FRAMES
+    assert result.summary["status_counts"]["skipped"] == 1
+    assert len(result.warnings) == 1, result.warnings
+    assert len(network.sent[ODOMETRY]) == N_FRAMES - 1
+    assert outputs.bag is not None
+    assert outputs.bag.exists()
+
+
+def test_a_stream_that_comes_late_is_paired_as_in_a_run(
+    drive_bag: Path, drive_run: Path, tmp_path: Path
+) -> None:
+    source = gvo.open_recording(drive_bag)
+    images = sorted(source.images(), key=lambda each: each.stream)  # all left ones, then all right
+    chosen = ChosenImages(info=source.info, images=lambda: iter(images))
+    ((folder, _),) = LiveOdometry(chosen, max_waiting=1000).run(tmp_path / "out", outputs=NO_REPORT)
+    assert_same_files(folder, drive_run, (*TABLES, "global.txt", "graph.g2o"))
 
 
 def test_images_that_nobody_takes_are_given_up_with_a_word(

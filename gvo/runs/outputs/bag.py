@@ -174,6 +174,10 @@ class RunMessages:
         if self._first_ns is None:
             return
         header = Header(frame.stamp_ns, self._frames.camera)
+        try:
+            self._writer.header(header)
+        except RecordingError:  # its stamp is what is wrong with it
+            header = Header(self._newest_ns, self._frames.camera)
         messages.write_diagnostics(
             self._writer, header, Status.SKIPPED, f"skipped: {frame.reason}", {}
         )
