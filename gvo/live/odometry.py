@@ -394,7 +394,7 @@ class WaitingPairs:
     Parameters
     ----------
     max_waiting : int
-        Pairs that may wait; when one more comes, the oldest is dropped.
+        Pairs that may wait, of 512 MB at most; when one more comes, the oldest is dropped.
     max_lag_s : float or None
         Drop a pair whose pose would be later than this, seconds, if tracking took as long as the
         slowest of the last twenty; never the newest pair. None: no limit.
@@ -442,9 +442,12 @@ class WaitingPairs:
             for index, item in enumerate(self._items)
             if not isinstance(item, FaultyFrame)
         ]
-        if len(pairs) > limit:
+        n_bytes = sum(image.n_bytes for _, pair in pairs for image in pair)
+        is_full = n_bytes > MAX_WAITING_BYTES and len(pairs) > 1
+        if len(pairs) > limit or is_full:
             index, oldest = pairs[0]
-            self._items[index] = self._dropped(oldest, f"{limit} pairs wait (--queue)")
+            reason = "512 MB of pairs wait" if is_full else f"{limit} pairs wait (--queue)"
+            self._items[index] = self._dropped(oldest, reason)
 
     def do(self, action: Callable[[], object]) -> None:
         """Have the tracking thread call `action` before it takes the next pair."""

@@ -89,11 +89,10 @@ class StandardInput:
                 continue
             header = _parse(line)
             stream = self._stream_of(header)
-            yield StampedImage(
-                stream=stream,
-                stamp_ns=_whole(header, "stamp_ns", lowest=-(2**63), highest=2**63 - 1),
-                load=self._loader(header, is_depth=stream == 1 and self.info.sensor == "rgbd"),
-            )
+            stamp_ns = _whole(header, "stamp_ns", lowest=-(2**63), highest=2**63 - 1)
+            load = self._loader(header, is_depth=stream == 1 and self.info.sensor == "rgbd")
+            n_bytes = load.args[0].data.nbytes
+            yield StampedImage(stream=stream, stamp_ns=stamp_ns, load=load, n_bytes=n_bytes)
 
     def ground_truth(self) -> Trajectory | None:
         """Return None."""
@@ -107,7 +106,7 @@ class StandardInput:
             raise RecordingError(f'{_WHERE}: "stream" must be one of {names}, got {shown}')
         return _STREAMS[str(name)]
 
-    def _loader(self, header: dict[str, Any], *, is_depth: bool) -> Callable[[], NDArray[Any]]:
+    def _loader(self, header: dict[str, Any], *, is_depth: bool) -> partial[NDArray[Any]]:
         """Read the bytes of an image; return the function that decodes them."""
         if "format" in header:
             size = _whole(header, "size", lowest=0, highest=_MAX_COMPRESSED)
@@ -199,7 +198,9 @@ class Device:
                 stamp_ns = self._stamp_ns(first_ns)
                 for stream, pixels in enumerate(self._retrieve()):
                     load = partial(np.asarray, pixels)
-                    yield StampedImage(stream=stream, stamp_ns=stamp_ns, load=load)
+                    yield StampedImage(
+                        stream=stream, stamp_ns=stamp_ns, load=load, n_bytes=pixels.nbytes
+                    )
         finally:
             for capture in self._captures:
                 capture.release()

@@ -24,6 +24,7 @@ from gvo.io.bag.topics import (
 from gvo.io.calibration.files import CalibrationPaths
 from gvo.io.poses.tf import TF_TYPES, TfBuffer, read_tf
 from gvo.io.recording import StampedImage
+from gvo.io.sync import MAX_WAITING_BYTES
 from gvo.live.transport import Transport
 
 _SMALL = (CAMERA_INFO_TYPE, *TF_TYPES)
@@ -31,7 +32,8 @@ _LOGGER = logging.getLogger(__name__)
 _OWN = "/gvo/"
 # Messages kept of each CameraInfo and tf topic, to read the calibration and the mount from.
 _N_KEPT: Final = 100
-# Images that may wait to be paired. Pairing is quick; pairs have a queue of their own.
+# Images that may wait to be paired, besides their memory. Pairing is quick; pairs have a queue of
+# their own.
 _N_WAITING: Final = 300
 _PAUSE_S = 0.2
 _SAID_AFTER = 5
@@ -51,6 +53,8 @@ class NetworkReader:
     ----------
     topics : list of Topic
         Those that others announce.
+    n_dropped : int
+        Images that were given up because too many waited to be paired.
     """
 
     damage = ""
@@ -59,7 +63,7 @@ class NetworkReader:
         self.transport = transport
         self.topics: list[Topic] = []
         self.notes: list[str] = []
-        self._is_crowded = False
+        self.n_dropped = 0
         self._kept: dict[str, deque[BagMessage]] = {}
         self._images: deque[BagMessage] = deque()
         self._changed = threading.Condition()
@@ -103,9 +107,11 @@ class NetworkReader:
             with self._changed:
                 self._changed.wait_for(lambda: self._images or self._is_closed)
                 if not self._images:
-                    return
+                    break
                 message = self._images.popleft()
             yield message
+        if self.n_dropped:
+            _LOGGER.warning("%d images were dropped before they were paired", self.n_dropped)
 
     def close(self) -> None:
         """End the images after those received so far."""
@@ -130,11 +136,12 @@ class NetworkReader:
             if not kept:
                 kept.append(message)
             self._images.append(message)
-            if len(self._images) > _N_WAITING:
+            n_bytes = sum(len(each.data) for each in self._images)
+            if len(self._images) > _N_WAITING or n_bytes > MAX_WAITING_BYTES:
                 self._images.popleft()
-                if not self._is_crowded:
-                    _LOGGER.warning("images are dropped: more than %d wait", _N_WAITING)
-                self._is_crowded = True
+                if self.n_dropped == 0:
+                    _LOGGER.warning("images are dropped: %d wait to be paired", len(self._images))
+                self.n_dropped += 1
             self._changed.notify_all()
 
 

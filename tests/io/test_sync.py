@@ -1,6 +1,7 @@
 """Pairing by stamp."""
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -149,6 +150,21 @@ def test_a_pair_is_given_with_its_last_image_where_the_period_is_known() -> None
     given_after = [n_pushed for _ in pairs]
     assert given_after[:5] == [3, 5, 7, 9, 11]
     assert given_after[12:] == [2 * n for n in range(13, 21)]
+
+
+@pytest.mark.parametrize("limit_ns", [0, 20])
+@pytest.mark.parametrize(("is_live", "n_paired"), [(True, 25), (False, 40)])
+def test_images_of_a_camera_that_wait_for_a_partner_take_512_mb(
+    limit_ns: int, is_live: bool, n_paired: int
+) -> None:
+    stamps = [33 * n for n in range(40)]
+    large = [replace(_image(0, stamp), n_bytes=20_000_000) for stamp in stamps]
+    images = [*large, *(_image(1, stamp) for stamp in stamps)]
+    items = [*pair_images(images, limit_ns=limit_ns, partner="depth", is_live=is_live)]
+    faulty = [item for item in items if isinstance(item, FaultyFrame)]
+    assert [item.stamp_ns for item in faulty] == stamps[: 40 - n_paired]  # the oldest
+    assert all("512 MB, wait already" in item.reason for item in faulty)
+    assert len(items) == 40
 
 
 def test_the_pairs_before_a_fault_of_the_recording_come_first() -> None:

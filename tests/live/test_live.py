@@ -3,6 +3,7 @@
 import io
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,16 @@ def test_for_one_more_the_oldest_is_dropped_and_says_so() -> None:
     assert [stamp for stamp, _ in found] == [1, 2, 3, 4, 5]
     assert ["2 pairs wait (--queue)" in reason for _, reason in found] == [True] * 3 + [False] * 2
     assert waiting.n_dropped == 3
+
+
+def test_pairs_that_wait_take_512_mb() -> None:
+    waiting = WaitingPairs(max_waiting=300)
+    for stamp_ms in range(60):
+        first, second = pair(stamp_ms)
+        waiting.put((replace(first, n_bytes=10**7), replace(second, n_bytes=10**7)))
+    reasons = [reason for _, reason in taken(waiting)]
+    assert reasons.count("") == 25
+    assert all("512 MB of pairs wait" in reason for reason in reasons[:-25])
 
 
 def test_nothing_is_dropped_before_two_frames_are_tied() -> None:

@@ -441,6 +441,12 @@ def test_images_that_nobody_takes_are_given_up_with_a_word(
     play._thread.join(timeout=60)
     assert len([*play.reader.images()]) == 300
     assert caplog.text.count("images are dropped") == 1
+    n_dropped = 20 * 2 * N_FRAMES - 300
+    assert f"{n_dropped} images were dropped before they were paired" in caplog.text
+    large, topic = bytes(60_000_000), next(t for t in play.reader.topics if t.type == IMAGE_TYPE)
+    for _ in range(20):
+        play.network.send(BagMessage(topic=topic, log_time_ns=0, data=large, is_ros1=False))
+    assert len([*play.reader.images()]) == 8  # of 512 MB
 
 
 def test_a_stream_that_stops_is_told_with_the_rate_of_the_other(
