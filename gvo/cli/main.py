@@ -208,10 +208,14 @@ def smooth(
     ] = None,
     sigma: Annotated[
         list[str] | None,
-        Option("--sigma", metavar="DEG,M", help="Noise of a step. Repeat to give one per input."),
+        Option(
+            "--sigma",
+            metavar="DEG,M",
+            help="Noise of a step, repeat to give one per input; of a graph's edges without any.",
+        ),
     ] = None,
     ground_truth: Annotated[
-        Path | None, Option(metavar="FILE", help="True poses: TUM, KITTI, EuRoC.")
+        Path | None, Option(metavar="FILE", help="True poses (docs/frames.md: pose files).")
     ] = None,
     robust: Annotated[
         _Robust | None,

@@ -36,6 +36,9 @@ _SWAPPED = np.array([3, 4, 5, 0, 1, 2])
 _ORDER = from_upper_triangle(np.arange(21.0)).astype(np.int64)
 _SWAPPED_ORDER = _ORDER[np.ix_(_SWAPPED, _SWAPPED)]
 _NORM_TOLERANCE = 1e-2
+_ROUNDING = 1e-9  # of an information matrix, relative
+_AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+_KINDS = {("z", "roll", "pitch"): ": a planar graph", _AXES: ": the edge says nothing"}
 _QUATERNION_TAGS = ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")
 _ANGLE_TAGS = ("VERTEX3", "EDGE3")
 
@@ -64,14 +67,16 @@ class Measurement:
     T_reference_frame : ndarray of float64, shape (4, 4)
         Maps coordinates of the frame to the reference, metres.
     covariance : ndarray of float64, shape (6, 6)
-        Of (rx, ry, rz, tx, ty, tz), right perturbation, in the frame; NaN if the information
-        matrix is singular.
+        Of (rx, ry, rz, tx, ty, tz), right perturbation, in the frame; NaN where there is a fault.
+    fault : str
+        What is wrong with the information matrix; empty if nothing.
     """
 
     reference_id: int
     frame_id: int
     T_reference_frame: FloatArray
     covariance: FloatArray
+    fault: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,7 +142,9 @@ def _numbers(fields: list[str]) -> tuple[list[int], list[float]]:
     if tag == "EDGE3" and len(fields) == 1 + n_ids + n_pose:
         fields = fields + _UNIT_INFORMATION
     if len(fields) != n_expected:
-        raise ValueError(f"{tag} needs {n_expected - 1} numbers, got {len(fields) - 1}")
+        without = n_ids == 2 and len(fields) == 1 + n_ids + n_pose
+        why = "; the information matrix is missing" if without else ""
+        raise ValueError(f"{tag} needs {n_expected - 1} numbers, got {len(fields) - 1}{why}")
     ids = [_id(field) for field in fields[1 : 1 + n_ids]]
     return ids, plain_floats(fields[1 + n_ids :])
 
@@ -151,10 +158,15 @@ def _lines_of(tag: str, rows: Sequence[tuple[int, list[int], list[float]]]) -> I
         for (_, ids, _), T in zip(rows, transforms, strict=True):
             yield Vertex(frame_id=ids[0], T_world_frame=T)
         return
-    covariances = _covariances(numbers[:, n_pose:], is_swapped=tag in _QUATERNION_TAGS)
-    for (_, ids, _), T, covariance in zip(rows, transforms, covariances, strict=True):
+    order = _SWAPPED_ORDER if tag in _QUATERNION_TAGS else _ORDER
+    noises = _noises(numbers[:, n_pose:][:, order])
+    for (_, ids, _), T, (covariance, fault) in zip(rows, transforms, noises, strict=True):
         yield Measurement(
-            reference_id=ids[0], frame_id=ids[1], T_reference_frame=T, covariance=covariance
+            reference_id=ids[0],
+            frame_id=ids[1],
+            T_reference_frame=T,
+            covariance=covariance,
+            fault=fault,
         )
 
 
@@ -188,18 +200,39 @@ def transforms_of(numbers: FloatArray) -> FloatArray:
     return se3.make_transform(np.asarray(R), numbers[:, :3])
 
 
-def _covariances(upper: FloatArray, *, is_swapped: bool) -> FloatArray:
-    """Return the inverses of information matrices, shape (n, 21) to (n, 6, 6)."""
-    information = upper[:, _SWAPPED_ORDER if is_swapped else _ORDER]
+def _noises(information: FloatArray) -> Iterator[tuple[FloatArray, str]]:
+    """Yield the inverse of each information matrix, shape (n, 6, 6), or what is wrong with it."""
+    covariances = _inverses(information)
+    if covariances is not None:
+        for covariance in covariances:
+            yield 0.5 * covariance + 0.5 * covariance.T, ""  # halves first: no overflow
+    elif len(information) == 1:
+        yield np.full((6, 6), np.nan), _information_fault(information[0])
+    else:
+        for matrix in information:
+            yield from _noises(matrix[np.newaxis])
+
+
+def _inverses(matrices: FloatArray) -> FloatArray | None:
+    """Return the inverses of positive definite matrices; None if one is not."""
     try:
-        covariances = np.linalg.inv(information)
+        np.linalg.cholesky(matrices)
+        return np.asarray(np.linalg.inv(matrices)) if np.isfinite(matrices).all() else None
     except np.linalg.LinAlgError:
-        if len(upper) == 1:
-            return np.full((1, 6, 6), np.nan)
-        rows = [_covariances(row[np.newaxis], is_swapped=is_swapped) for row in upper]
-        return np.concatenate(rows)
-    # halves first: no overflow
-    return np.asarray(0.5 * covariances + 0.5 * covariances.transpose(0, 2, 1))
+        return None
+
+
+def _information_fault(information: FloatArray) -> str:
+    """Say why a matrix of (rx, ry, rz, tx, ty, tz) is no information."""
+    if not np.all(np.isfinite(information)):
+        return "information is not finite"
+    values = np.linalg.eigvalsh(information)
+    if values[0] < -_ROUNDING * values[-1] or values[-1] < 0.0:
+        return "information is not positive definite"
+    rows = information[_SWAPPED]
+    names = [name for name, row in zip(_AXES, rows, strict=True) if not np.any(row)]
+    zeros = f" ({', '.join(names)} are zero{_KINDS.get(tuple(names), '')})" if names else ""
+    return f"information is singular{zeros}"
 
 
 def format_vertex(frame_id: int | str, T_world_frame: FloatArray) -> str:

@@ -17,6 +17,7 @@ from gvo.trajectory.g2o import (
     format_edge,
     format_vertex,
     parse_line,
+    parse_lines,
 )
 from tests.trajectory.paths import seeds
 
@@ -91,10 +92,38 @@ def test_lines_of_other_kinds_are_passed_over(text: str) -> None:
     assert parse_line(text) is None
 
 
-def test_a_singular_information_matrix_gives_no_covariance() -> None:
-    edge = parse_line("EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 1" + " 0" * 21)
-    assert isinstance(edge, Measurement)
-    assert np.isnan(edge.covariance).all()
+@pytest.mark.parametrize(
+    ("diagonal", "changes", "fault"),
+    [
+        ((4, 4, 4, 9, 9, 9), {}, ""),
+        ((1e-9, 1e9, 1, 1e9, 1e-9, 1), {}, ""),
+        ((4, 4, 0, 0, 0, 9), {}, "singular (z, roll, pitch are zero: a planar graph)"),
+        ((0, 0, 0, 9, 9, 9), {}, "singular (x, y, z are zero)"),
+        ((0,) * 6, {}, "singular (x, y, z, roll, pitch, yaw are zero: the edge says nothing)"),
+        ((4, 4, 4, 9, 9, 9), {(0, 1): 4.0}, "singular"),
+        ((4, 4, 4, 9, 9, 9), {(0, 3): 6.1}, "not positive definite"),
+        ((4, 4, -4, 9, 9, 9), {}, "not positive definite"),
+        ((-4, 0, 0, 0, 0, 0), {}, "not positive definite"),
+        ((4, 4, np.nan, 9, 9, 9), {}, "not finite"),
+        ((4, 4, np.inf, 9, 9, 9), {}, "not finite"),
+    ],
+)
+def test_what_is_wrong_with_an_information_matrix_is_said(
+    diagonal: tuple[float, ...], changes: dict[tuple[int, int], float], fault: str
+) -> None:
+    information = np.diag(np.array(diagonal, dtype=float))
+    for (row, column), value in changes.items():
+        information[row, column] = value
+    numbers = " ".join(map(str, information[np.triu_indices(6)]))
+    sound = "EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 1" + " 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"
+    lines = parse_lines([sound, f"EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 1 {numbers}", sound])
+    faults = [line.fault for line in lines if isinstance(line, Measurement)]
+    is_known = [
+        np.isfinite(line.covariance).all() for line in lines if isinstance(line, Measurement)
+    ]
+    assert faults[0] == faults[2] == ""
+    assert faults[1].endswith(fault)
+    assert is_known == [True, not fault, True]
 
 
 @pytest.mark.parametrize(
@@ -107,7 +136,7 @@ def test_a_singular_information_matrix_gives_no_covariance() -> None:
         ("VERTEX_SE3:QUAT 0 1 2 x 0 0 0 1", "x"),
         ("VERTEX_SE3:QUAT 0 1 2 3 0 0 0 2", "length 2"),
         ("VERTEX_SE3:QUAT 0 1 2 3 0 0 0 nan", "length nan"),
-        ("EDGE_SE3:QUAT 0 1 1 2 3 0 0 0 1", "needs 30 numbers"),
+        ("EDGE_SE3:QUAT 0 1 1 2 3 0 0 0 1", "needs 30 numbers, got 9; the information .* missing"),
     ],
 )
 def test_a_malformed_line_is_refused(text: str, words: str) -> None:

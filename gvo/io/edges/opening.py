@@ -15,7 +15,10 @@ from gvo.io.edges.pose_graph import PoseGraphSource
 from gvo.io.edges.pose_streams import FusedChains, PoseStream, StepSigma, read_stream
 from gvo.io.opening import BAG_SUFFIXES
 
-_KINDS = "expected a pose graph of g2o, poses (TUM, KITTI, EuRoC), or a bag with topics of poses"
+_KINDS = (
+    "expected a pose graph of g2o, poses (TUM, KITTI, EuRoC and others, see docs/frames.md), or a "
+    "bag with topics of poses"
+)
 
 
 def open_edges(
@@ -30,7 +33,8 @@ def open_edges(
     topics : sequence of str
         Of the bags; where empty, the only topic of poses of each.
     sigmas : sequence of StepSigma
-        For each stream in the order of the inputs, or one for all; the default's where empty.
+        For each stream in the order of the inputs, or one for all; the default's where empty. For
+        a pose graph one, of the edges whose information matrix is none.
 
     Returns
     -------
@@ -89,9 +93,9 @@ def parse_sigma(text: str) -> StepSigma:
 def _open_graph(paths: Sequence[Path], graph: Path, sigmas: Sequence[StepSigma]) -> PoseGraphSource:
     if len(paths) > 1:
         raise ConfigurationError(f"{graph}: a pose graph of g2o is smoothed alone; give one input")
-    if sigmas:
-        raise ConfigurationError(f"--sigma: {graph} states the noise of its edges itself")
-    return PoseGraphSource(graph)
+    if len(sigmas) > 1:
+        raise ConfigurationError(f"--sigma: {graph} is one input; give it once")
+    return PoseGraphSource(graph, *sigmas)
 
 
 def _spread(sigmas: Sequence[StepSigma], streams: Sequence[PoseStream]) -> list[StepSigma]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import deque
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from itertools import chain, count, islice
 from operator import itemgetter
 from pathlib import Path
@@ -12,9 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from gvo._text import text_lines
-from gvo.errors import OutputError, TrajectoryError, write_faults
+from gvo.errors import ConfigurationError, OutputError, TrajectoryError, write_faults
 from gvo.geometry.edges import inverse
 from gvo.io.edges.events import EdgeEvent, Event, InputFaults, PoseEvent, anchor
+from gvo.io.edges.pose_streams import StepSigma
 from gvo.io.run_folder.line_file import replace_text
 from gvo.trajectory import g2o
 from gvo.types import Edge, FloatArray, FrameId
@@ -24,6 +26,7 @@ _TAG = re.compile(r"[A-Z][A-Z0-9_]*(:[A-Z0-9_]+)*$")
 GRAPH = "smoothed.g2o"
 # Lines that are parsed together.
 _BLOCK = 512
+_N_LISTED = 12
 
 
 class PoseGraphSource:
@@ -39,22 +42,26 @@ class PoseGraphSource:
     ----------
     path : Path
         Text file.
+    sigma : StepSigma, optional
+        Noise of edges whose information matrix is none; they are refused without it.
 
     Attributes
     ----------
     vertices : dict of int to ndarray of float64, shape (4, 4)
         T_world_frame of all vertices.
     measurement_lines : list of str
-        All edges and `FIX` up to the first line that is not understood, as they were read, the
-        older edges in the newer form.
+        All edges that are used and `FIX`, up to the first line that is not understood, as they
+        were read; the older edges in the newer form, those without information with the sigma.
 
     Raises
     ------
     TrajectoryError
-        When the file cannot be read or holds no edge between poses in 3-D.
+        When the file cannot be read, gives an id twice, or holds no edge between poses in 3-D.
+    ConfigurationError
+        When there is a `sigma`, and no edge needs it.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, sigma: StepSigma | None = None) -> None:
         self.name = path.stem
         self.faults = InputFaults()
         self.has_made_up_stamps = True
@@ -63,14 +70,22 @@ class PoseGraphSource:
         self._edges: list[g2o.Measurement] = []
         self._fixed_ids: list[int] = []
         self._fault = ""
+        self._sigma, self._n_given = sigma, 0
+        self._repeated: set[int] = set()
         self._read(path)
+        if self._repeated:
+            ids = ", ".join(map(str, sorted(self._repeated)[:_N_LISTED]))
+            raise TrajectoryError(
+                f"{path}: {len(self._repeated)} ids are given to more than one vertex: {ids}"
+                f"{', ...' * (len(self._repeated) > _N_LISTED)}; give each pose its own"
+            )
         self.n_poses = len(self.vertices)
         if not self._edges:
-            foreign = "".join(f" ({warning})" for warning in self.faults.warnings())
+            known = f"expected lines of {' or '.join(g2o.MEASUREMENT_TAGS)}"
+            found = "; ".join(self.faults.warnings()) or known
             raise TrajectoryError(
                 self._fault
-                or f"{path}: holds no edge between poses in 3-D; expected lines of "
-                f"{' or '.join(g2o.MEASUREMENT_TAGS)}{foreign}"
+                or f"{path}: holds no edge between poses in 3-D that can be used; {found}"
             )
         first = self._fixed_ids[:1] or list(self.vertices)[:1] or [self._edges[0].reference_id]
         self._start_id = first[0]
@@ -79,6 +94,12 @@ class PoseGraphSource:
             "stamps: the order of the poses, a second each; a g2o file has none",
             f"world: pose {self._start_id} is {origin}",
         ]
+        if sigma is not None:
+            if not self._n_given:
+                raise ConfigurationError(f"--sigma: {path} states the noise of its edges itself")
+            self.decisions.append(
+                f"noise: {sigma.describe()} of {self._n_given} edges without information"
+            )
 
     def events(self) -> Iterator[Event]:
         """Yield poses and edges in file order.
@@ -118,14 +139,28 @@ class PoseGraphSource:
     def _add(self, lines: Iterable[g2o.Line | None], block: Iterable[tuple[int, str]]) -> None:
         for line, (_, text) in zip(lines, block, strict=True):
             if isinstance(line, g2o.Vertex):
+                if line.frame_id in self.vertices:
+                    self._repeated.add(line.frame_id)
                 self.vertices[line.frame_id] = line.T_world_frame
                 continue
             if isinstance(line, g2o.Measurement):
-                self._edges.append(line)
+                self._add_edge(line, text)
             elif isinstance(line, g2o.Fix):
                 self._fixed_ids += line.frame_ids
-            if line is not None:
-                self.measurement_lines.append(g2o.convert_line(text))
+                self.measurement_lines.append(text.strip())
+
+    def _add_edge(self, line: g2o.Measurement, text: str) -> None:
+        if line.fault and self._sigma is None:
+            kind = f"edges were refused: their {line.fault}, give --sigma DEG,M to use them"
+            self.faults.add(kind, f"{line.reference_id} {line.frame_id}")
+            return
+        if line.fault and self._sigma is not None:
+            self._n_given += 1
+            T, covariance = line.T_reference_frame, self._sigma.covariance(line.T_reference_frame)
+            line = replace(line, covariance=covariance)
+            text = g2o.format_edge(line.reference_id, line.frame_id, T, covariance)
+        self._edges.append(line)
+        self.measurement_lines.append(g2o.convert_line(text))
 
     def _note_foreign(self, path: Path, block: Iterable[tuple[int, str]]) -> None:
         for number, text in block:

@@ -48,7 +48,7 @@ class PoseStream:
 
 
 def read_stream(path: Path) -> PoseStream:
-    """Read the poses of a TUM, KITTI or EuRoC file, with the covariances of the file beside it."""
+    """Read a file of poses, with the covariances of the file beside it."""
     poses, decision = read_trajectory(path), ""
     covariances = np.full((len(poses), 6, 6), np.nan)
     if poses.covariances is not None:

@@ -112,7 +112,7 @@ def read_ground_truth(path: str | Path) -> Trajectory:
     Parameters
     ----------
     path : str or Path
-        A file of poses (TUM, KITTI, EuRoC), a recording's folder, or a bag that names its ground
+        A file of poses (docs/frames.md), a recording's folder, or a bag that names its ground
         truth; what lies inside of a bag as `BAG#tf:PARENT:CHILD` or `BAG#TOPIC`.
 
     Returns

@@ -7,11 +7,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gvo.errors import TrajectoryError
+from gvo.errors import ConfigurationError, TrajectoryError
 from gvo.geometry import se3
 from gvo.io.edges.events import Event, PoseEvent
+from gvo.io.edges.opening import open_edges, parse_sigma
 from gvo.io.edges.pose_graph import GRAPH, PoseGraphSource, write_graph
-from gvo.trajectory.g2o import format_edge, format_vertex
+from gvo.trajectory.g2o import Measurement, format_edge, format_vertex, parse_line
 from gvo.types import FloatArray, PosePrior
 
 
@@ -128,6 +129,47 @@ def test_foreign_tags_are_counted(tmp_path: Path) -> None:
     assert len(list(source.events())) == 2
     (warning,) = source.faults.warnings()
     assert "VERTEX_TRACKXYZ in line 2" in warning
+
+
+_PLANAR = "EDGE_SE3:QUAT 1 2 1 0 0 0 0 0 1 4 0 0 0 0 0 4 0 0 0 0 0 0 0 0 0 0 0 0 0 9"
+
+
+def test_edges_without_information_are_refused_with_their_number(tmp_path: Path) -> None:
+    indefinite = _PLANAR.replace(" 9", " -9")
+    lines = [edge_line(0, 1), _PLANAR, indefinite, edge_line(1, 2), indefinite]
+    source = PoseGraphSource(write(tmp_path, *lines))
+    assert [describe(event)[0] for event in source.events()] == ["pose"] * 3
+    assert source.measurement_lines == [edge_line(0, 1), edge_line(1, 2)]
+    planar, others = source.faults.warnings()
+    assert planar.startswith("1 edges were refused: their information is singular (z, roll, pitch")
+    assert others.startswith("2 edges were refused: their information is not positive definite")
+    assert others.endswith("the first: 1 2")
+    with pytest.raises(TrajectoryError, match=r"no edge .* a planar graph\), give --sigma DEG,M"):
+        PoseGraphSource(write(tmp_path, _PLANAR))
+
+
+def test_edges_without_information_take_the_noise_that_is_given(tmp_path: Path) -> None:
+    path = write(tmp_path, edge_line(0, 1), _PLANAR)
+    source = open_edges([path], sigmas=[parse_sigma("0.5,0.25")])
+    assert isinstance(source, PoseGraphSource)
+    *_, last = source.events()
+    assert isinstance(last, PoseEvent)
+    sigmas = np.repeat([np.radians(0.5), 0.25], 3)
+    np.testing.assert_allclose(last.edges[0].covariance, np.diag(sigmas**2))
+    (stated,) = [line for line in map(parse_line, source.measurement_lines[1:]) if line]
+    assert isinstance(stated, Measurement)
+    np.testing.assert_allclose(stated.covariance, np.diag(sigmas**2))
+    assert "0.5 deg, 0.25 m" in source.decisions[-1]
+    with pytest.raises(ConfigurationError, match="states the noise of its edges itself"):
+        open_edges([write(tmp_path, edge_line(0, 1))], sigmas=[parse_sigma("0.5,0.25")])
+    with pytest.raises(ConfigurationError, match="give it once"):
+        open_edges([path], sigmas=[parse_sigma("0.5,0.25")] * 2)
+
+
+def test_ids_given_twice_are_named(tmp_path: Path) -> None:
+    vertices = [format_vertex(n, translation(n)) for n in (*range(20), *range(14), 5)]
+    with pytest.raises(TrajectoryError, match=r"14 ids .* vertex: 0, 1, .*, 11, \.\.\.; give"):
+        PoseGraphSource(write(tmp_path, *vertices, edge_line(0, 1)))
 
 
 def test_measurements_are_given_as_they_were_read(tmp_path: Path) -> None:
