@@ -12,7 +12,7 @@ from typing import Final, TypeVar
 from gvo.config import Config
 from gvo.errors import CalibrationError, RecordingError
 from gvo.io.bag.reader import BagMessage
-from gvo.io.bag.source import BagSource
+from gvo.io.bag.source import BagSource, ImageStamps
 from gvo.io.bag.topics import (
     CAMERA_INFO_TYPE,
     IMAGE_TYPES,
@@ -178,9 +178,10 @@ class TopicSource(BagSource):
 
     def images(self) -> Iterator[StampedImage]:
         """Yield images as they arrive, until `close`."""
+        stamps = ImageStamps()
         for message in self._network.images():
             if message.topic.name in self.image_topics:
-                yield self._stamped(message, self.image_topics.index(message.topic.name))
+                yield self._stamped(message, self.image_topics.index(message.topic.name), stamps)
 
     def transforms(self, frames: Collection[str] | None = None) -> TfBuffer:
         """Return all transforms received so far."""

@@ -19,7 +19,7 @@ from gvo.errors import ConfigurationError
 from gvo.geometry import se3
 from gvo.io.bag.messages import stamp_of, transform_of
 from gvo.io.bag.reader import BagMessage, BagReader, serialize, typestore
-from gvo.io.bag.topics import IMAGE_TYPE
+from gvo.io.bag.topics import IMAGE_TYPE, IMAGE_TYPES
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import ChosenImages, StampedImage
 from gvo.live.odometry import LiveOdometry, LiveRun, Stretches
@@ -334,24 +334,33 @@ def test_what_is_missing_is_said_until_it_comes(drive_bag: Path) -> None:
         assert missing in text, said
 
 
-def test_a_damaged_message_is_a_faulty_frame(drive_bag: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("drive", lambda data: data[:100]),
+        ("room", lambda data: data[:100]),
+        ("drive", lambda _: b""),
+        ("room", lambda _: b"\xff" * 99),
+    ],
+)
+def test_a_damaged_message_is_a_faulty_frame_at_its_stamp(
+    name: str, data: Callable[[bytes], bytes], tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
     def script(play: Play) -> None:
         n_images = 0
         for message in play.messages:
-            if "image" in message.topic.name:
-                n_images += 1
-                if n_images == 11:
-                    message = BagMessage(
-                        topic=message.topic,
-                        log_time_ns=message.log_time_ns,
-                        data=message.data[:100],
-                        is_ros1=message.is_ros1,
-                    )
-            play.network.send(message)
+            n_images += message.topic.type in IMAGE_TYPES
+            sent = data(message.data) if n_images == 11 else message.data
+            late_ns = message.log_time_ns + 3600 * SECOND_NS  # the clock of the computer
+            play.network.send(replace(message, data=sent, log_time_ns=late_ns))
 
-    ((_, result),) = Play(drive_bag, script).run(tmp_path / "out")
-    assert result.summary["frames"] >= N_FRAMES - 1
-    assert not result.is_complete
+    ((folder, result),) = Play(request.getfixturevalue(f"{name}_bag"), script).run(tmp_path / "out")
+    assert result.summary["status_counts"]["skipped"] == 1
+    stamps = [
+        [int(row.split(",")[0]) for row in (run / "frames.csv").read_text().splitlines()[1:]]
+        for run in (folder, request.getfixturevalue(f"{name}_run"))
+    ]
+    np.testing.assert_allclose(np.diff(stamps, axis=0), 0, atol=2)
 
 
 def image(stamp_ms: int, stream: int = 0) -> StampedImage:

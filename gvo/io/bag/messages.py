@@ -37,13 +37,26 @@ from gvo.types import DepthArray, Failure, FloatArray, ImageArray
 if TYPE_CHECKING:
     from rosbags.typesys.stores import ros2_humble as ros
 
+    from gvo.io.bag.reader import BagMessage
+
 _NORM_TOLERANCE = 1e-2  # of quaternions
+# After the number of ROS 1, or the encoding of CDR, of four bytes.
+_STAMP_END = 12
 _COMPRESSED_DEPTH_HEADER = struct.Struct("<iff")
 
 
 def stamp_of(header: ros.std_msgs__msg__Header) -> int:
     """Return the stamp of a header of ROS 1 or ROS 2 in nanoseconds."""
     return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+
+
+def header_stamp(message: BagMessage) -> int | None:
+    """Return the stamp at the start of a message that cannot be decoded; None if it is none."""
+    if len(message.data) < _STAMP_END:
+        return None
+    is_little = message.is_ros1 or message.data[1] & 1
+    seconds, nanoseconds = struct.unpack_from("<iI" if is_little else ">iI", message.data, 4)
+    return None if nanoseconds >= 10**9 else int(seconds * 10**9 + nanoseconds)
 
 
 def bare(name: str) -> str:

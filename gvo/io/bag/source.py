@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -18,6 +19,7 @@ from gvo.io.bag.messages import (
     decode_compressed_depth,
     decode_depth,
     decode_grey_or_color,
+    header_stamp,
     stamp_of,
 )
 from gvo.io.bag.reader import BagMessage, BagReader, MessageReader
@@ -51,6 +53,20 @@ CAMERA_CHANGED = (
 """What follows where a `CameraInfo` changes on the way, and what to do."""
 _N_LISTED = 12
 _LATEST_NS = 2**63 - 1  # in MCAP it may be later
+
+
+class ImageStamps:
+    """The last stamps of both streams, from which that of a damaged image is guessed."""
+
+    def __init__(self) -> None:
+        self.last_ns: tuple[deque[int], deque[int]] = (deque(maxlen=2), deque(maxlen=2))
+
+    def of_damaged(self, message: BagMessage, stream: int) -> int:
+        """Return the stamp of the header, else the next one by the period, else the log time."""
+        stamp_ns, last_ns = header_stamp(message), self.last_ns[stream]
+        if stamp_ns is None and last_ns:
+            stamp_ns = 2 * last_ns[-1] - last_ns[0]
+        return min(message.log_time_ns, _LATEST_NS) if stamp_ns is None else stamp_ns
 
 
 class BagSource:
@@ -134,7 +150,7 @@ class BagSource:
             At the end, where a part of the bag could not be read, or a topic that announces
             messages yields none.
         """
-        counts = [0, 0]
+        counts, stamps = [0, 0], ImageStamps()
         self._watch = watch = CameraInfoWatch()
         for message in self._reader.messages({*self.image_topics, *self._info_names}):
             if message.topic.name in self._info_names:
@@ -142,7 +158,7 @@ class BagSource:
                 continue
             stream = self.image_topics.index(message.topic.name)
             counts[stream] += 1
-            yield self._stamped(message, stream)
+            yield self._stamped(message, stream, stamps)
         if self._reader.damage:
             raise RecordingError(self._reader.damage)
         for topic, count in zip((self._topics.first, self._topics.second), counts, strict=True):
@@ -234,16 +250,17 @@ class BagSource:
                 raise
             raise RecordingError(f"{error}; {self._reader.damage}") from error
 
-    def _stamped(self, message: BagMessage, stream: int) -> StampedImage:
+    def _stamped(self, message: BagMessage, stream: int, stamps: ImageStamps) -> StampedImage:
         log_time_ns = min(message.log_time_ns, _LATEST_NS)
         try:
             content = message.decode()
         except RecordingError as error:
-            # Without a header there is no other stamp than that of the recording.
-            stamp_ns, load = log_time_ns, partial(_fail, str(error))
+            stamp_ns, load = stamps.of_damaged(message, stream), partial(_fail, str(error))
         else:
-            stamp_ns = log_time_ns if self._takes_log_time else stamp_of(content.header)
+            stamp_ns = stamp_of(content.header)
             load = partial(self._decoder(message.topic, stream), content)
+        stamp_ns = log_time_ns if self._takes_log_time else stamp_ns
+        stamps.last_ns[stream].append(stamp_ns)
         if log_time_ns != message.log_time_ns:
             reason = f"{message.topic.name}: recorded at {message.log_time_ns} ns, which is no time"
             load = partial(_fail, reason)
