@@ -53,6 +53,8 @@ _FAR = 0.01
 _MAX_STEPS = 10
 # Poses that leave at once when the window is made smaller: the cost grows with the cube.
 _MAX_LEAVING = 32
+# Poses between two fixes for which the window grows: an update takes about 20 ms then.
+_MAX_FIX_INTERVAL = 300
 _FAILURES = RuntimeError, IndexError
 
 
@@ -105,6 +107,7 @@ class PoseGraph:
         self._config, self._factors = config, Factors(config)
         self._finished: list[Estimate] = []
         self._n_keys = 0
+        self._is_warned = False
         self._begin()
 
     def reconfigure(self, config: WindowConfig) -> None:
@@ -116,6 +119,8 @@ class PoseGraph:
     def _begin(self) -> None:
         self.poses.clear()
         self._is_whole, self._is_hardened = self._config.size is None, False
+        self._last_fix_key: int | None = None
+        self._fix_interval = 0
         self._isam = gtsam.ISAM2(self._parameters())
 
     def _parameters(self) -> gtsam.ISAM2Params:
@@ -175,14 +180,35 @@ class PoseGraph:
         """Return the frames to marginalize with the next pose: neither recent nor kept."""
         if self._config.size is None:
             return []
-        old = islice(self.poses.items(), max(len(self.poses) + 1 - self._config.size, 0))
+        # A pose stays until a fix comes after it: else each fix would move the newest poses alone.
+        size = max(self._config.size, self._fix_interval + 1)
+        old = islice(self.poses.items(), max(len(self.poses) + 1 - size, 0))
         return [frame_id for frame_id, pose in old if not pose.is_kept][:_MAX_LEAVING]
 
     # What goes in
 
     def insert(self, new: NewPose) -> tuple[FloatArray, FloatArray]:
         """Add a pose, let old ones leave; return T_world_frame (4, 4) and its covariance (6, 6)."""
-        return self._attempt(lambda: self._insert(new))
+        answer = self._attempt(lambda: self._insert(new))
+        if new.prior is not None:
+            self._note_fix(self._n_keys - 1)
+        return answer
+
+    def _note_fix(self, key: int) -> None:
+        """Learn how many poses lie between the measurements of poses in the world."""
+        last, self._last_fix_key = self._last_fix_key, key
+        if last is None or key <= last:
+            return
+        if (interval := key - last) > _MAX_FIX_INTERVAL:
+            if not self._is_warned and self._config.size is not None:
+                _LOGGER.warning(
+                    "priors are %d poses apart, and the window holds at most %d for them: "
+                    "set window.size to null to smooth over all poses",
+                    interval,
+                    _MAX_FIX_INTERVAL,
+                )
+            self._is_warned, interval = True, 0
+        self._fix_interval = interval
 
     def _insert(self, new: NewPose) -> tuple[FloatArray, FloatArray]:
         if self._is_whole and self._config.size is not None:  # from now on poses leave
@@ -235,6 +261,8 @@ class PoseGraph:
         factor = self._factor(pose.key, measured)
         estimate = self._attempt(lambda: self._add_factor(frame_id, factor))
         pose.measured.append((measured, factor))
+        if not isinstance(measured, Edge):
+            self._note_fix(pose.key)
         return estimate
 
     def _add_factor(self, frame_id: FrameId, factor: gtsam.NoiseModelFactor) -> Estimate:

@@ -44,6 +44,22 @@ def test_the_window_holds_the_recent_and_the_kept_alone() -> None:
     assert (4 in window, 3 in window) == (True, False)
 
 
+@pytest.mark.parametrize(("interval", "n_poses"), [(2, 5), (10, 11), (300, 301), (301, 5)])
+def test_the_window_grows_to_the_interval_of_its_fixes(
+    interval: int, n_poses: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    window = SlidingWindow(WindowConfig(size=5))
+    for frame in range(2 * interval + 1):
+        edges = [edge(frame - 1, STEP)] if frame else []
+        place = PositionPrior(position_world=power(frame)[:3, 3], covariance=np.eye(3))
+        fix = place if frame % interval == 0 else None
+        assert window.add_pose(frame, frame * STEP_NS, edges, fix).rejected == ()
+        assert len(window) <= (5 if frame <= interval else n_poses)
+    assert len(window) == n_poses
+    warnings = [record.getMessage() for record in caplog.records]
+    assert [("301 poses apart" in each) for each in warnings] == [True] * (n_poses < interval)
+
+
 def test_keyframes_are_told_oldest_first_until_they_are_released() -> None:
     window = walk(WindowConfig(size=2), 3)
     window.keep(2)

@@ -114,6 +114,7 @@ class WindowMachine(RuleBasedStateMachine):
         self.rng = np.random.default_rng(seed)
         self.size, self.is_manual = size, keyframes == "manual"
         self.n_keyframes = 0 if self.is_manual else 3
+        self.last_fix, self.fix_interval = -1, 0
         config = WindowConfig(size=size, kernel=kernel, gate=gate, n_keyframes=3)
         self.window = SlidingWindow(config, keyframes=keyframes)
         self.add([], prior, 1)
@@ -179,6 +180,8 @@ class WindowMachine(RuleBasedStateMachine):
             self.check_refusal(refused, frame)
         if any(q == "broken" for _, q, _, _ in wanted) or prior in ("nan", "absurd"):
             assert estimate.rejected
+        if given is not None and all(each.reference_id is not None for each in estimate.rejected):
+            self.note_fix(frame)
         self.check_size()
 
     # What must hold.
@@ -199,10 +202,16 @@ class WindowMachine(RuleBasedStateMachine):
         assert refused.reason
         self.n_rejected += 1
 
+    def note_fix(self, frame: int) -> None:
+        if self.last_fix >= 0:
+            self.fix_interval = max(self.fix_interval, frame - self.last_fix)
+        self.last_fix = max(self.last_fix, frame)
+
     def check_size(self) -> None:
         if self.size is not None:
             kept = self.kept & set(self.live())
-            assert len(self.window) <= self.size + len(kept) + self.n_keyframes
+            size = max(self.size, self.fix_interval + 1)
+            assert len(self.window) <= size + len(kept) + self.n_keyframes
 
     @invariant()
     def the_poses_of_the_window_are_sound(self) -> None:
@@ -260,6 +269,8 @@ class WindowMachine(RuleBasedStateMachine):
         answer = self.window.add_prior(frame, prior)
         is_good = kind not in ("nan", "absurd", "no covariance")
         self.check_late(answer, frame, before, is_good=is_good)
+        if answer:
+            self.note_fix(frame)
 
     def check_late(
         self,
