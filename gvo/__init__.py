@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from gvo.io.frames import frames as frames
     from gvo.io.opening import RecordingOptions as RecordingOptions
     from gvo.io.opening import open_recording as open_recording
+    from gvo.io.poses.inputs import evaluate as evaluate
     from gvo.io.poses.inputs import read_ground_truth as read_ground_truth
     from gvo.io.synthetic import SyntheticRecording as SyntheticRecording
     from gvo.odometry.loops import LoopDetector as LoopDetector
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from gvo.runs.smooth import optimize as optimize
     from gvo.runs.smooth import smooth_edges as smooth_edges
     from gvo.trajectory.evaluation import Evaluation as Evaluation
-    from gvo.trajectory.evaluation import evaluate as evaluate
     from gvo.trajectory.evaluation import format_evaluations as format_evaluations
     from gvo.trajectory.formats import read_trajectory as read_trajectory
     from gvo.trajectory.trajectory import Trajectory as Trajectory
@@ -72,7 +72,7 @@ _MODULES = {
     "gvo.odometry.odometry": ("Odometry",),
     "gvo.io.convert.convert": ("convert",),
     "gvo.viz.plots": ("plot_trajectories",),
-    "gvo.io.poses.inputs": ("read_ground_truth",),
+    "gvo.io.poses.inputs": ("evaluate", "read_ground_truth"),
     "gvo.runs.outputs.options": ("RunOutputs",),
     "gvo.runs.result": ("RunResult",),
     "gvo.runs.run": ("run_recording",),
@@ -82,7 +82,7 @@ _MODULES = {
     "gvo.io.frames": ("Rig", "frames"),
     "gvo.io.opening": ("RecordingOptions", "open_recording"),
     "gvo.io.synthetic": ("SyntheticRecording",),
-    "gvo.trajectory.evaluation": ("Evaluation", "evaluate", "format_evaluations"),
+    "gvo.trajectory.evaluation": ("Evaluation", "format_evaluations"),
     "gvo.trajectory.formats": ("read_trajectory",),
     "gvo.trajectory.trajectory": ("Trajectory",),
     "gvo.types": (

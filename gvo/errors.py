@@ -1,15 +1,48 @@
 """Errors of the input: files, topics, configurations, calibrations."""
 
 import json
+import re
 import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from typing import ClassVar
 
 from gvo._text import cut, shortened_words
 
 _MAX_MESSAGE = 4000  # characters
+
+
+# A flag with its value, if that is a word in capitals; a command in backticks stays as it is.
+_FLAG = re.compile(
+    r"`[^`]*`|(?<![\w/.-])--(?:set ([^\s,;)]+)|(no-)?([a-z][a-z-]*)(?:( )(?=[A-Z]))?)"
+)
+
+
+def said(text: str) -> str:
+    """Return a message that names flags in Python's words, unless the command line asks."""
+    return text if GvoError.names_flags else _FLAG.sub(_in_python, text)
+
+
+def _in_python(flag: re.Match[str]) -> str:
+    setting, no, name, has_value = flag.groups()
+    if name is None:
+        return flag[0] if setting is None else f'settings=["{setting}"]'
+    name = name.replace("-", "_")
+    if no or name == "force":
+        return f"{name}={not no}"
+    return f"{name}=" if has_value else name
+
+
+@contextmanager
+def flags_named() -> Iterator[None]:
+    """Let messages name the flags of the command line, not the parameters of Python."""
+    before, GvoError.names_flags = GvoError.names_flags, True
+    try:
+        yield
+    finally:
+        GvoError.names_flags = before
 
 
 class GvoError(Exception):
@@ -19,9 +52,11 @@ class GvoError(Exception):
     printed on one line, with invisible characters escaped and long names cut.
     """
 
+    names_flags: ClassVar[bool] = False
+
     def __str__(self) -> str:
         """Return the message."""
-        return cut(shortened_words(super().__str__()), _MAX_MESSAGE)
+        return said(cut(shortened_words(super().__str__()), _MAX_MESSAGE))
 
 
 class RecordingError(GvoError):

@@ -631,6 +631,11 @@ class Optimum:
     error: float | None = None
     n_iterations: int = 0
 
+    def __repr__(self) -> str:
+        """Return one line: how many poses, edges and loops."""
+        sizes = len(self.estimates), len(self.edges), len(self.loops)
+        return "Optimum({} poses, {} edges, {} loops)".format(*sizes)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrameResult:
@@ -691,6 +696,10 @@ class FrameResult:
     T_previous_frame: FloatArray | None = None
     T_map_world: FloatArray = field(default_factory=lambda: np.eye(4))
     stage_ms: dict[str, float] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        """Return one line: the causal pose, and what the registration rests on."""
+        return f"FrameResult({self.causal}, {self.n_inliers} inliers of {self.n_matches} matches)"
 
     @property
     def stamp_ns(self) -> int:

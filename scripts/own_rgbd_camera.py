@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 
 import gvo
-from gvo.trajectory.formats import write_tum
 
 
 def read_frames(folder: Path, *, rate_hz: float, depth_scale: float) -> Iterator[gvo.RgbdFrame]:
@@ -53,13 +52,11 @@ def main() -> int:
     camera = gvo.PinholeCamera(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
 
     odometry = gvo.Odometry(camera)
-    smoothed: list[gvo.Estimate] = []
     for frame in read_frames(arguments.folder, **options):
         result = odometry.track(frame)
         print(frame.stamp_ns, result.status, result.causal.T_world_frame[:3, 3])
-        smoothed += result.finished
-    smoothed += odometry.finish()
-    write_tum(arguments.out, gvo.Trajectory.of(smoothed))
+    smoothed = odometry.trajectories()["smoothed"]
+    smoothed.write(arguments.out)
     print(f"wrote {arguments.out}: {len(smoothed)} poses")
     return 0
 

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import settings
 
 import gvo
+from gvo.errors import GvoError
 from gvo.kernels.jit import machine_code
 
 # How long an example takes says something of the machine, nothing of the code. The examples are the
@@ -30,7 +31,11 @@ _IS_CI = os.environ.get("CI") == "true"
 
 
 def pytest_sessionstart() -> None:
-    """Compile the kernels once, of which a command would tell on standard error."""
+    """Compile the kernels once, of which a command would tell on standard error.
+
+    Messages name flags, as they are written; `test_errors` tells what Python says instead.
+    """
+    GvoError.names_flags = True
     machine_code()
 
 

@@ -8,7 +8,36 @@ from types import SimpleNamespace
 import pytest
 
 import gvo.errors
-from gvo.errors import GvoError, OutputError, missing_extra, named_faults, write_faults
+from gvo.errors import (
+    GvoError,
+    OutputError,
+    flags_named,
+    missing_extra,
+    named_faults,
+    said,
+    write_faults,
+)
+
+
+@pytest.mark.parametrize(
+    ("words", "in_python"),
+    [
+        ("give --left TOPIC --right TOPIC (or --depth)", "give left=TOPIC right=TOPIC (or depth)"),
+        ("by --out, or --force to replace it", "by out, or force=True to replace it"),
+        ("--ground-truth /robot: of base_link", "ground_truth /robot: of base_link"),
+        ("not with --no-report", "not with report=False"),
+        ("(--set depth.scale=5000 if right)", '(settings=["depth.scale=5000"] if right)'),
+        ("see `gvo config --all`; a--b, /x/--force", "see `gvo config --all`; a--b, /x/--force"),
+    ],
+)
+def test_python_is_told_parameters_and_the_command_line_flags(
+    monkeypatch: pytest.MonkeyPatch, words: str, in_python: str
+) -> None:
+    monkeypatch.setattr(GvoError, "names_flags", False)
+    assert str(OutputError(words)) == said(words) == in_python
+    with flags_named():
+        assert str(OutputError(words)) == words
+    assert str(OutputError(words)) == in_python
 
 
 def test_in_a_clone_the_clone_is_installed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

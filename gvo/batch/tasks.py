@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeAlias
 from gvo._text import read_text
 from gvo._version import __version__
 from gvo.config import Config
-from gvo.errors import ConfigurationError, GvoError, OutputError, RunBusyError
+from gvo.errors import ConfigurationError, GvoError, OutputError, RunBusyError, flags_named
 from gvo.io.excerpt import Excerpt
 from gvo.io.opening import RecordingOptions, open_recording
 from gvo.io.poses.base_frame import BaseFrame
@@ -188,6 +188,7 @@ class Task:
         )
 
 
+@flags_named()
 def run_task(
     task: Task, options: TaskOptions, *, on_progress: Callable[[Progress], None] | None = None
 ) -> BatchRow:

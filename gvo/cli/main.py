@@ -27,13 +27,12 @@ from gvo.cli.terminal import (
     exit_code,
     progress,
     report,
-    report_smoothed,
     say,
     status,
     warn,
     work_on_run,
 )
-from gvo.errors import ConfigurationError, GvoError, OutputError, named_faults
+from gvo.errors import ConfigurationError, GvoError, OutputError, flags_named, named_faults
 
 if TYPE_CHECKING:
     from gvo.io.edges.events import EdgeSource
@@ -260,7 +259,7 @@ def smooth(
     of_window = {"config": parameters, "keyframes": keyframes or "distance"}
     options = of_window if window or is_stream else of_batch
     result = _smoothed(source, out, window, **options, ground_truth=truth, force=force)
-    report_smoothed(result, out, is_stdout_taken=is_stream)
+    report(result, out, is_stdout_taken=is_stream)
 
 
 def _smoothed(source: EdgeSource | None, out: Path, window: bool, **options: Any) -> RunResult:  # noqa: ANN401
@@ -425,7 +424,7 @@ def _run() -> Any:  # noqa: ANN401 - an exit code, or None
 def main() -> None:
     """Run the command; one line and exit code 2 for bad input."""
     try:
-        with ended_by_signals(), named_faults(GvoError, "gvo"):
+        with flags_named(), ended_by_signals(), named_faults(GvoError, "gvo"):
             raise SystemExit(_run() or 0)
     except typer.Abort:
         raise SystemExit(130) from None

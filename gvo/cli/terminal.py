@@ -117,61 +117,18 @@ def exit_code(is_complete: bool) -> int:
     return 0 if is_complete else 3
 
 
-def report(result: RunResult, out: Path) -> NoReturn:
-    """Print the result of a run, and end with its exit code."""
-    tell(result, out)
+def report(result: RunResult, out: Path, *, is_stdout_taken: bool = False) -> NoReturn:
+    """Print a result, and end with its exit code."""
+    tell(result, out, is_stdout_taken=is_stdout_taken)
     raise typer.Exit(exit_code(result.is_complete))
 
 
-def tell(result: RunResult, out: Path) -> None:
-    """Print the result of a run."""
-    from gvo.frontend.offsets import describe_offsets
-    from gvo.io.run_folder.verdict import loop_words, verdict
-    from gvo.trajectory.evaluation import format_evaluations
-
-    for key in ("base_frame", "ground_truth"):
-        say(f"{key.replace('_', ' ')}: {result.summary[key]}")
-    if result.evaluations:
-        say(format_evaluations(result.evaluations), nl=False)
-    learnt = describe_offsets(result.summary["rig_offsets"])
-    if learnt:
-        say(f"learnt of the camera: {learnt}")
-    say(verdict(result.summary))
-    loops = loop_words(result.summary)
-    if loops:
-        say(loops)
-    say(out if result.report is None else result.report)
+def tell(result: RunResult, out: Path, *, is_stdout_taken: bool = False) -> None:
+    """Print a result."""
+    say(f"{result}\n", nl=False, err=is_stdout_taken)
+    if result.report is None:
+        say(out, err=is_stdout_taken)
     warn(result.warnings)
-
-
-def report_smoothed(result: RunResult, out: Path, *, is_stdout_taken: bool = False) -> NoReturn:
-    """Print the result of smoothing, and end with its exit code."""
-    from gvo.trajectory.evaluation import format_evaluations
-
-    if result.evaluations:
-        say(format_evaluations(result.evaluations), nl=False, err=is_stdout_taken)
-    summary = result.summary
-    if summary["batch"] is not None:
-        say(_error_words(summary["batch"]), err=is_stdout_taken)
-    n_edges = summary["edges"] if "edges" in summary else summary["window"]["n_edges"]
-    counts = f"{summary['frames']} poses, {n_edges} edges"
-    say(f"{counts}; {out / 'trajectories.png'}", err=is_stdout_taken)
-    warn(result.warnings)
-    raise typer.Exit(exit_code(result.is_complete))
-
-
-def _error_words(batch: Mapping[str, Any]) -> str:
-    """Return the error of a batch optimization and the errors of its starts, as text."""
-    if "error_isam2" in batch:
-        return f"error {batch['error_isam2']:.6g} by iSAM2, {batch['error']:.6g} in a batch"
-    starts = batch["errors_of_starts"]
-    others = (f"{name} {error:.6g}" for name, error in starts.items() if name != batch["start"])
-    first = f"{batch['start']} {starts[batch['start']]:.6g}"
-    refused = f", {batch['refused_edges']} edges refused" if batch["refused_edges"] else ""
-    return (
-        f"error {batch['error']:.6g} after {batch['iterations']} iterations{refused}; start: "
-        f"{', '.join([first, *others])}"
-    )
 
 
 def warn(warnings: Sequence[str]) -> None:

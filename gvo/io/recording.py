@@ -94,6 +94,12 @@ class RecordingInfo:
     frame_id: str = ""
     T_body_cam: FloatArray | None = None
 
+    def __repr__(self) -> str:
+        """Return one line: name, sensor, number and size of the images."""
+        first = self.calibrations[0]
+        images = f"{self.n_images} images of {first.width}x{first.height}"
+        return f"RecordingInfo({self.name}: {self.sensor}, {images})"
+
     @property
     def stream_names(self) -> tuple[str, str]:
         """What stream 0 and 1 are called in messages."""
@@ -119,6 +125,11 @@ class Source(Protocol):
 
     def ground_truth(self) -> Trajectory | None:
         """Return T_world_cam of stream 0's rectified camera, where the recording holds it."""
+
+
+def shown(source: Source) -> str:
+    """Return a source as one line: name, sensor, number and size of the images."""
+    return repr(source.info).replace(RecordingInfo.__name__, type(source).__name__, 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

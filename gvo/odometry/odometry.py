@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from array import array
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias
@@ -24,6 +25,7 @@ from gvo.odometry.graph import RunGraph
 from gvo.odometry.keyframes import Keyframes, judge_links, link_keyframes, misclosure
 from gvo.odometry.map import Map
 from gvo.odometry.path import source_ns
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import (
     Edge,
     Estimate,
@@ -122,6 +124,7 @@ class Odometry:
         self._previous: Estimate | None = None  # by the raw chain
         self._map = Map(self._config, self._frontend.recognizer, self._window, self._keyframes)
         self._trust = DepthTrust()
+        self._poses = array("d")  # raw and causal ones, upper three rows
         self.link_gain = LINK_GAIN
 
     @property
@@ -241,6 +244,31 @@ class Odometry:
         graph.settle(self._window.estimate(frame_id) for frame_id in self._window.poses())
         return graph.optimize()
 
+    def trajectories(self) -> dict[str, Trajectory]:
+        """Return the poses of all frames so far as "raw", "causal", "smoothed" and "global".
+
+        Call it after the last frame, or between two. Raw and causal poses come without their
+        covariances, which each `FrameResult` holds. See `optimize` for the global ones.
+
+        Raises
+        ------
+        SmoothingError
+            As `optimize`.
+        """
+        optimum, path = self.optimize(), self._map.graph.path
+        T = np.tile(np.eye(4), (len(path), 2, 1, 1))
+        T[:, :, :3] = np.reshape(self._poses, (-1, 2, 3, 4))
+        stamps_ns = np.array(path.stamps_ns)
+        raw, causal = (Trajectory(stamps_ns=stamps_ns, T_world_frame=T[:, k]) for k in (0, 1))
+        smoothed, best = map(Trajectory.of, (path.estimates(), optimum.estimates))
+        return {"raw": raw, "causal": causal, "smoothed": smoothed, "global": best}
+
+    def __repr__(self) -> str:
+        """Return one line: the camera, the frames so far, and the keyframes."""
+        n, n_kept = len(self._map.graph.path), len(self._keyframes.kept)
+        seen = self._camera or "a front-end of your own"
+        return f"Odometry({seen}, {n} frames, {n_kept} keyframes)"
+
     def _result(
         self,
         observations: _Observations,
@@ -256,6 +284,8 @@ class Odometry:
         answer = step.registration or step.failure
         finished = tuple(self._window.pop_finished())
         self._map.graph.settle(finished)
+        for estimate in (step.estimate, causal):
+            self._poses.extend(estimate.T_world_frame[:3].ravel())
         return FrameResult(
             raw=replace(step.estimate, frame_id=step.estimate.stamp_ns),
             causal=causal,

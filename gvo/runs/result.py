@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gvo.trajectory.evaluation import Evaluation
+from gvo._text import visible
+from gvo.errors import said
+from gvo.frontend.offsets import describe_offsets
+from gvo.io.run_folder.verdict import loop_words, verdict
+from gvo.trajectory.evaluation import Evaluation, format_evaluations
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -33,3 +38,47 @@ class RunResult:
     is_complete: bool
     warnings: tuple[str, ...]
     report: Path | None = None
+
+    def __repr__(self) -> str:
+        """Return what the command line prints of it: errors, verdict, where the report is."""
+        return said("\n".join(map(visible, self._lines())))
+
+    def _lines(self) -> Iterator[str]:
+        summary, is_smoothed = self.summary, "base_frame" not in self.summary
+        if not is_smoothed:
+            yield f"base frame: {summary['base_frame']}"
+            yield f"ground truth: {summary['ground_truth']}"
+        if self.evaluations:
+            yield from format_evaluations(self.evaluations).splitlines()
+        yield from _smoothing_words(summary) if is_smoothed else _run_words(summary)
+        if self.report is not None:
+            yield str(self.report)
+
+
+def _run_words(summary: Mapping[str, Any]) -> Iterator[str]:
+    learnt = describe_offsets(summary["rig_offsets"])
+    if learnt:
+        yield f"learnt of the camera: {learnt}"
+    yield verdict(summary)
+    yield from filter(None, [loop_words(summary)])
+
+
+def _smoothing_words(summary: Mapping[str, Any]) -> Iterator[str]:
+    if summary["batch"] is not None:
+        yield _error_words(summary["batch"])
+    n_edges = summary["edges"] if "edges" in summary else summary["window"]["n_edges"]
+    yield f"{summary['frames']} poses, {n_edges} edges"
+
+
+def _error_words(batch: Mapping[str, Any]) -> str:
+    """Return the error of a batch optimization and the errors of its starts, as text."""
+    if "error_isam2" in batch:
+        return f"error {batch['error_isam2']:.6g} by iSAM2, {batch['error']:.6g} in a batch"
+    starts = batch["errors_of_starts"]
+    others = (f"{name} {error:.6g}" for name, error in starts.items() if name != batch["start"])
+    first = f"{batch['start']} {starts[batch['start']]:.6g}"
+    refused = f", {batch['refused_edges']} edges refused" if batch["refused_edges"] else ""
+    return (
+        f"error {batch['error']:.6g} after {batch['iterations']} iterations{refused}; start: "
+        f"{', '.join([first, *others])}"
+    )

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gvo.config import Config
-from gvo.errors import GvoError, RecordingError
+from gvo.errors import GvoError, RecordingError, said
 from gvo.io.bag.source import CAMERA_CHANGED, describe_camera_changes
 from gvo.io.excerpt import Excerpt
 from gvo.io.frames import Through
@@ -187,7 +187,7 @@ def _conclude(
         )
     compared = _compare(truth, folder, loop)
     warnings = [*loop.statistics.warnings(), *_warnings_of_camera(loop.source)]
-    warnings += [*faults, *_warnings_of_truth(compared)]
+    warnings = [*map(said, warnings), *faults, *map(said, _warnings_of_truth(compared))]
     evaluations: tuple[Evaluation, ...] = ()
     if isinstance(compared, TruthComparison):
         folder.write_truth(compared.truth.trajectory)

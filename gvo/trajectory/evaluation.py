@@ -87,6 +87,11 @@ class Evaluation:
     reference_share: float
     path_ratio: float | None
 
+    def __repr__(self) -> str:
+        """Return one line: how many poses, and the root mean squares of their errors."""
+        rpe = f"{number_text(self.rpe_m)} m, {number_text(self.rpe_deg)} deg"
+        return f"Evaluation({self.name}: {self.n} poses, ATE {self.ate_m:.4g} m, RPE {rpe})"
+
     @property
     def n(self) -> int:
         """Number of associated poses."""
@@ -114,38 +119,7 @@ def evaluate(
     max_difference_ns: int = MAX_DIFFERENCE_NS,
     rpe_delta: int = 1,
 ) -> Evaluation:
-    """Associate an estimate with its reference, align it and measure its errors.
-
-    Parameters
-    ----------
-    reference, estimate : Trajectory
-        Poses of the same frame, see `Trajectory.transformed`.
-    name : str
-        Of the estimate.
-    align : {"none", "origin", "se3", "sim3"}
-        How the estimate is aligned first, see `alignment`.
-    segments : sequence of float, optional
-        Segment lengths in metres; by default KITTI's 100 to 800 m if the associated reference is
-        at least 800 m long, else 20 and 50 m.
-    segment_step : int, optional
-        Poses between the starts of segments; by default 10 as in KITTI, or 1, likewise.
-    max_difference_ns : int
-        Largest difference of associated stamps, nanoseconds; see `pair`.
-    rpe_delta : int
-        Distance of the two poses of a relative pose error, in poses.
-
-    Returns
-    -------
-    Evaluation
-
-    Raises
-    ------
-    TrajectoryError
-        If fewer than three poses can be associated, `sim3` finds no scale, or `origin` lacks a
-        rotation.
-    ValueError
-        If a segment length, the step or the delta is not positive.
-    """
+    """Associate, align and measure, as `gvo.io.poses.inputs.evaluate` says."""
     ref, est = pair(reference, estimate, max_difference_ns=max_difference_ns, name=name)
     if len(ref) < _MIN_POSES:
         raise TrajectoryError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from decimal import Decimal
+from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
@@ -17,6 +18,7 @@ from gvo.geometry import se3
 from gvo.types import Estimate, FloatArray, IntArray
 
 StampsFrom = Literal["file", "times", "rows", "topic"]
+PoseLayout = Literal["tum", "kitti", "euroc"]
 
 _ROTATION_TOLERANCE = 1e-3
 _BLOCK = 4096  # poses checked at once, which takes several times their memory
@@ -211,6 +213,30 @@ class Trajectory:
         if not self.has_rotations:
             T_map_frame = _unrotated(T_map_frame[:, :3, 3])
         return replace(self, T_world_frame=T_map_frame)
+
+    def write(self, path: str | Path, *, layout: PoseLayout | None = None) -> None:
+        """Write the poses as a file that gvo and other tools read; covariances are left out.
+
+        Parameters
+        ----------
+        path : str or Path
+            Overwritten if it exists.
+        layout : {"tum", "kitti", "euroc"}, optional
+            By default EuRoC's where the name ends in .csv, else TUM's. KITTI's holds no stamps.
+
+        Raises
+        ------
+        ValueError
+            If the layout is unknown, or there are no rotations.
+        TrajectoryError
+            If the file cannot be written.
+        """
+        from gvo.trajectory import formats  # which reads trajectories, too
+
+        layout = layout or ("euroc" if Path(path).suffix == ".csv" else "tum")
+        if layout not in get_args(PoseLayout):
+            raise ValueError(f"layout must be one of {get_args(PoseLayout)}, got {layout!r}")
+        getattr(formats, f"write_{layout}")(path, self)
 
     def interpolate(self, stamps_ns: IntArray, *, max_gap_ns: int | None = None) -> Trajectory:
         """Interpolate poses at given stamps: positions linearly, rotations by SLERP.

@@ -72,7 +72,14 @@ def style(salt: str = "gvo") -> Iterator[None]:
 
 def new_figure(height: float, width: float = WIDE) -> Figure:
     """Return an empty figure, inches, that makes room for labels and legends by itself."""
-    return Figure(figsize=(width, height), layout="constrained")
+    return ShownFigure(figsize=(width, height), layout="constrained")
+
+
+class ShownFigure(Figure):
+    """A figure that a notebook shows, without `pyplot` and its backends."""
+
+    def _repr_png_(self) -> bytes:
+        return _encoded(self, ".png", salt="gvo")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -115,10 +122,14 @@ class Plot:
     def _encoded(self, suffix: str) -> bytes:
         if self.figure is None:
             raise ValueError(f"{self.slug} has no figure")
-        buffer = io.BytesIO()
-        with style(self.slug):
-            _write(self.figure, buffer, suffix)
-        return buffer.getvalue()
+        return _encoded(self.figure, suffix, salt=self.slug)
+
+
+def _encoded(figure: Figure, suffix: str, *, salt: str) -> bytes:
+    buffer = io.BytesIO()
+    with style(salt):
+        _write(figure, buffer, suffix)
+    return buffer.getvalue()
 
 
 def save_figure(figure: Figure, path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,31 +12,39 @@ from gvo.trajectory.alignment import AlignMode
 from gvo.trajectory.trajectory import Trajectory
 from gvo.viz.names import check_suffix
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 _FLAT = 0.05  # extent of a flat axis, relative to another
 _DOWN = 0.8  # cosine, on the mean, of the camera's y axis and that of a world whose y points down
 
 
 def plot_trajectories(
-    path: str | Path,
+    path: str | Path | None,
     reference: Trajectory | None,
     estimates: Mapping[str, Trajectory],
     *,
     align: AlignMode = "se3",
-) -> None:
+) -> Figure:
     """Draw trajectories from above, and their errors (or positions) over time.
 
     Equal input gives equal files.
 
     Parameters
     ----------
-    path : str or Path
-        With suffix .png, .pdf or .svg.
+    path : str or Path, or None
+        File with suffix .png, .pdf or .svg; None writes none.
     reference : Trajectory or None
         Without one, positions over time are drawn instead of errors.
     estimates : mapping of str to Trajectory
         By name, at least one; "raw", "causal", "smoothed" and "global" have fixed colours.
     align : {"none", "origin", "se3", "sim3"}
         Alignment of each estimate with the reference.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A notebook shows it where it is the last value of a cell.
 
     Raises
     ------
@@ -46,7 +55,7 @@ def plot_trajectories(
     ValueError
         When there is no estimate, or one without poses.
     """
-    path = Path(path)
+    path = None if path is None else Path(path)
     check_suffix(path)
     if not estimates or any(len(estimate) == 0 for estimate in estimates.values()):
         raise ValueError("expected at least one estimate, and poses in each")
@@ -59,7 +68,9 @@ def plot_trajectories(
             figure = figure_of_positions(estimates)
         else:
             figure = figure_of_errors(reference, estimates, align)
-        save_figure(figure, path)
+        if path is not None:
+            save_figure(figure, path)
+    return figure
 
 
 def is_of_camera(reference: Trajectory) -> bool:

@@ -34,15 +34,10 @@ def output(script: Script) -> Output:
     return run
 
 
-def test_a_rendered_bag_is_run_and_raw_compared_with_smoothed(
-    output: Output, tmp_path: Path
-) -> None:
+def test_a_bag_is_rendered(output: Output, tmp_path: Path) -> None:
     options = ["--world", "handheld", "--sensor", "rgbd", "--frames", 4]
     output("make_demo_bag", tmp_path / "room.bag", *options)
     assert gvo.open_recording(tmp_path / "room.bag").info.n_images == 4
-    ran = output("run_bag", tmp_path / "room.bag", "out", "--set", "window.n_links=2")
-    assert [line.split()[0] for line in ran[-2:]] == ["raw", "smoothed"]
-    assert (tmp_path / "out" / "compared.png").exists()
 
 
 def test_edges_of_a_table_are_smoothed(output: Output, tmp_path: Path) -> None:
@@ -124,7 +119,6 @@ def test_an_rgbd_camera_of_ones_own_is_tracked_without_a_dropped_frame(
         ("smooth_edges", "missing.csv"),
         ("smooth_pose_stream", "missing.txt"),
         ("odometry_of_opencv", "missing"),
-        ("run_bag", "missing.bag out"),
         ("feed_recording", "missing.bag"),
         ("make_demo_bag", "x.bag --frames 0"),
         ("make_pictures", "--frame 0"),

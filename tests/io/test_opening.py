@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+import gvo
 from gvo.errors import CalibrationError, RecordingError
 from gvo.io.datasets.kitti import KittiSource
 from gvo.io.datasets.tum import TumSource
@@ -61,3 +62,11 @@ def test_compressed_files_of_ros2_are_bags_with_and_without_metadata(tmp_path: P
     file.touch()
     assert is_bag(file)
     assert is_bag(tmp_path)
+
+
+def test_a_source_is_shown_in_a_line() -> None:
+    source = gvo.SyntheticRecording("driving", "stereo", n_frames=3, scale=0.25)
+    images = "(driving-stereo: stereo, 3 images of 306x92)"
+    assert [repr(each) for each in (source, source.info)] == [
+        f"{name}{images}" for name in ("SyntheticRecording", "RecordingInfo")
+    ]

@@ -35,6 +35,7 @@ CAMERA = StereoCamera(fx=200.0, fy=200.0, cx=159.5, cy=99.5, width=320, height=2
 PINHOLE = PinholeCamera(fx=200.0, fy=200.0, cx=159.5, cy=99.5, width=320, height=200)
 STEP_NS = 50_000_000
 N_FRAMES = 16
+NAMES = ("raw", "causal", "smoothed", "global")
 # Planes n . p = c of a room, and the two axes that their texture is laid along.
 PLANES = [
     (np.array([0.0, 0.0, 1.0]), 4.0, [0, 1]),
@@ -177,6 +178,37 @@ def test_a_depth_camera_is_followed_to_centimetres() -> None:
     assert all(result.status == Status.OK for result in results)
     for estimates in ([r.raw for r in results], [r.causal for r in results], smoothed):
         assert position_errors(estimates).max() < 0.06
+
+
+def test_the_trajectories_so_far_and_at_the_end_are_those_of_the_results() -> None:
+    results, smoothed = stereo_run()
+    odometry = Odometry(CAMERA, configure())
+    for index in range(N_FRAMES):
+        odometry.track(stereo_frame(index))
+        if index == 8:
+            early = odometry.trajectories()
+    assert {name: len(each) for name, each in early.items()} == dict.fromkeys(NAMES, 9)
+    odometry.finish()
+    found = odometry.trajectories()
+    expected = [[r.raw for r in results], [r.causal for r in results], smoothed, smoothed]
+    for name, estimates in zip(NAMES, expected, strict=True):
+        assert found[name].stamps_ns.tolist() == [e.stamp_ns for e in estimates], name
+        poses = [e.T_world_frame for e in estimates]
+        np.testing.assert_allclose(found[name].T_world_frame, poses, atol=1e-12, err_msg=name)
+        whole = early[name].stamps_ns
+        np.testing.assert_array_equal(whole, found[name].stamps_ns[: len(whole)])
+    assert found["smoothed"].covariances is not None
+
+
+def test_a_notebook_shows_one_line_of_each_result() -> None:
+    odometry = Odometry(CAMERA, configure())
+    for index in range(2):
+        result = odometry.track(stereo_frame(index))
+    shown = [repr(odometry), repr(result), repr(odometry.optimize())]
+    assert all("\n" not in text and len(text) < 200 for text in shown)
+    assert "2 frames" in shown[0]
+    assert f"{result.n_inliers} inliers of {result.n_matches} matches" in shown[1]
+    assert shown[2] == "Optimum(2 poses, 1 edges, 0 loops)"
 
 
 def test_what_a_frame_gave_is_counted() -> None:

@@ -59,3 +59,8 @@ def test_the_json_holds_all_columns_of_the_table() -> None:
     n_columns = len(format_evaluations([]).splitlines()[0].split("  ")) - 1
     assert len(content["estimates"][0]) > n_columns
     assert (FULL.n, FULL.ate_m, BARE.ate_m) == (2, 12.5**0.5, 1234.5)
+
+
+def test_an_evaluation_is_shown_in_a_line() -> None:
+    assert repr(FULL) == "Evaluation(smoothed: 2 poses, ATE 3.536 m, RPE 0.01235 m, 0.25 deg)"
+    assert repr(BARE).endswith(": 1 poses, ATE 1234 m, RPE - m, - deg)")

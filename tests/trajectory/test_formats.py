@@ -19,7 +19,7 @@ from gvo.trajectory.formats import (
     write_kitti,
     write_tum,
 )
-from gvo.trajectory.trajectory import Trajectory
+from gvo.trajectory.trajectory import PoseLayout, Trajectory
 from tests.trajectory.paths import random_trajectory, seeds
 
 GOOD = "1.0 0 0 0 0 0 0 1\n"
@@ -146,6 +146,30 @@ def test_a_euroc_file_is_told_by_its_header_or_its_17_columns(tmp_path: Path, co
     assert trajectory.stamps_ns.tolist() == [1_403_636_579_763_555_584]
     T = trajectory.T_world_frame[0]
     np.testing.assert_allclose(T @ [1, 0, 0, 1], [1, 3, 3, 1], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "layout", "start"),
+    [
+        ("a.txt", None, "0.100000000 "),
+        ("a.csv", None, "#timestamp"),
+        ("a.csv", "tum", "0.100000000 "),
+        ("a.txt", "kitti", "1.000000000000e+00 "),
+    ],
+)
+def test_a_trajectory_writes_itself(
+    tmp_path: Path, name: str, layout: PoseLayout | None, start: str
+) -> None:
+    T = se3.exp(np.outer(np.arange(4), [0.0, 0.1, 0.0, 1.0, 0.0, 0.2]))
+    written = Trajectory(stamps_ns=np.arange(1, 5) * 10**8, T_world_frame=T)
+    written.write(tmp_path / name, layout=layout)
+    assert (tmp_path / name).read_text().startswith(start)
+    found = read_trajectory(tmp_path / name)
+    np.testing.assert_allclose(found.T_world_frame, T, atol=1e-9)
+    if layout != "kitti":
+        np.testing.assert_array_equal(found.stamps_ns, written.stamps_ns)
+    with pytest.raises(ValueError, match="layout must be one of"):
+        written.write(tmp_path / name, layout="csv")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("place", ["poses/times.txt", "sequences/00/times.txt"])

@@ -1,6 +1,7 @@
 """Plots of trajectories, seen through their pixels and their SVG text."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -89,6 +90,16 @@ def test_without_a_reference_the_positions_are_drawn(tmp_path: Path) -> None:
     for label in ("x [m]", "y [m]", "z [m]", "elapsed [s]", "raw", "smoothed"):
         assert f">{label}</text>" in text
     assert "reference" not in text
+
+
+def test_a_notebook_shows_the_figure_that_is_written(tmp_path: Path) -> None:
+    estimates = {"raw": curve(1)}
+    shown: Any = plot_trajectories(None, curve(0), estimates)
+    written: Any = plot_trajectories(tmp_path / "plot.png", curve(0), estimates)
+    pictures = [figure._repr_png_() for figure in (shown, written)]
+    assert pictures[0] == pictures[1]
+    assert pictures[0].startswith(b"\x89PNG")
+    assert [path.name for path in tmp_path.iterdir()] == ["plot.png"]
 
 
 def test_a_file_of_another_kind_and_nothing_to_draw_are_refused(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from itertools import takewhile
 from typing import Literal, TypeAlias
 
 from gvo._text import format_table, visible
+from gvo.errors import said
 
 Verdict: TypeAlias = Literal["ok", "warning", "fault", "info", "unknown"]
 _N_DIGITS = 3
@@ -76,6 +77,10 @@ class CheckResult:
 
     recording: str
     findings: tuple[Finding, ...]
+
+    def __repr__(self) -> str:
+        """Return what `gvo check` prints."""
+        return said(format_check(self).rstrip())
 
     @property
     def is_healthy(self) -> bool:

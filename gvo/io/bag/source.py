@@ -43,7 +43,7 @@ from gvo.io.poses.truth import (
     in_frame,
     read_poses,
 )
-from gvo.io.recording import RecordingInfo, Source, StampedImage
+from gvo.io.recording import RecordingInfo, Source, StampedImage, shown
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FloatArray
 
@@ -140,6 +140,8 @@ class BagSource:
     def image_topics(self) -> tuple[str, str]:
         """Names of the topics of stream 0 and 1."""
         return self._topics.first.name, self._topics.second.name
+
+    __repr__ = shown
 
     def images(self) -> Iterator[StampedImage]:
         """Yield the images of both topics in the order of recording.

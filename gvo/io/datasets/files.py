@@ -15,7 +15,7 @@ from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.io.calibration.files import CameraSet
 from gvo.io.images import GreyRange, read_image
-from gvo.io.recording import RecordingInfo, Sensor, StampedImage
+from gvo.io.recording import RecordingInfo, Sensor, StampedImage, shown
 from gvo.trajectory.trajectory import parse_stamp
 
 StampedPath = tuple[int, str]
@@ -71,6 +71,8 @@ class FolderSource:
         )
         self._load = loader(config)
         self._load_second = load_second or self._load
+
+    __repr__ = shown
 
     def images(self) -> Iterator[StampedImage]:
         """Yield the images of both streams in the order of their stamps, not decoded yet."""

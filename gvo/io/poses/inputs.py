@@ -29,6 +29,9 @@ from gvo.io.poses.truth import (
     read_poses,
 )
 from gvo.io.recording import Source
+from gvo.trajectory import evaluation
+from gvo.trajectory.alignment import MAX_DIFFERENCE_NS, AlignMode
+from gvo.trajectory.evaluation import Evaluation
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure
@@ -128,6 +131,63 @@ def read_ground_truth(path: str | Path) -> Trajectory:
     return _read(str(path)).trajectory
 
 
+def evaluate(
+    reference: Trajectory | str | Path,
+    estimate: Trajectory | str | Path,
+    *,
+    name: str | None = None,
+    align: AlignMode = "se3",
+    segments: Sequence[float] | None = None,
+    segment_step: int | None = None,
+    max_difference_ns: int = MAX_DIFFERENCE_NS,
+    rpe_delta: int = 1,
+) -> Evaluation:
+    """Associate an estimate with its reference, align it and measure its errors.
+
+    Parameters
+    ----------
+    reference, estimate : Trajectory, str or Path
+        Poses of the same frame, see `Trajectory.transformed`; or what `read_ground_truth` reads.
+    name : str, optional
+        Of the estimate; by default that of its file, else "estimate".
+    align : {"none", "origin", "se3", "sim3"}
+        How the estimate is aligned first, see `alignment`.
+    segments : sequence of float, optional
+        Segment lengths in metres; by default KITTI's 100 to 800 m, and 20 and 50 m where the
+        associated reference is shorter than 200 m.
+    segment_step : int, optional
+        Poses between the starts of segments; by default 10 as in KITTI, or 1, likewise.
+    max_difference_ns : int
+        Largest difference of associated stamps, nanoseconds; see `pair`.
+    rpe_delta : int
+        Distance of the two poses of a relative pose error, in poses.
+
+    Returns
+    -------
+    Evaluation
+
+    Raises
+    ------
+    TrajectoryError
+        If a file cannot be read, fewer than three poses can be associated, `sim3` finds no scale,
+        or `origin` lacks a rotation.
+    ValueError
+        If a segment length, the step or the delta is not positive.
+    """
+    truth = _given(reference)
+    found = _given(estimate, truth)
+    return evaluation.evaluate(
+        truth.trajectory,
+        found.trajectory,
+        name=name or found.name,
+        align=align,
+        segments=segments,
+        segment_step=segment_step,
+        max_difference_ns=max_difference_ns,
+        rpe_delta=rpe_delta,
+    )
+
+
 def read_compared(
     reference: str, estimates: Sequence[str]
 ) -> tuple[Trajectory, dict[str, Trajectory], list[str]]:
@@ -168,6 +228,12 @@ def _is_in_bag(text: str) -> bool:
         return is_bag(Path(text))
     path, mark, _ = text.partition(_MARK)
     return bool(mark) and exists(Path(path))
+
+
+def _given(poses: Trajectory | str | Path, reference: Poses | None = None) -> Poses:
+    if isinstance(poses, Trajectory):
+        return Poses(trajectory=poses, name="estimate")
+    return _read(str(poses), reference)
 
 
 def _read(text: str, reference: Poses | None = None) -> Poses:

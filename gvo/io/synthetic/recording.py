@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gvo.geometry.camera import Calibration, PinholeCamera
 from gvo.geometry.se3 import invert, make_transform
-from gvo.io.recording import RecordingInfo, Sensor, StampedImage
+from gvo.io.recording import RecordingInfo, Sensor, StampedImage, shown
 from gvo.io.synthetic.rendering import scale_camera, to_uint8
 from gvo.io.synthetic.sensor import SensorNoise, expose, spoil_depth
 from gvo.io.synthetic.world import WORLDS, World, WorldName
@@ -102,6 +102,8 @@ class SyntheticRecording:
             n_images=len(self._elapsed_ns),
             decisions=[f"rendered: world {self._world.name}, seed {self._seed}"],
         )
+
+    __repr__ = shown
 
     def images(self) -> Iterator[StampedImage]:
         """Yield the images of both streams, frame by frame."""

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import gvo
 from gvo.errors import RecordingError
 from gvo.geometry import se3
 from gvo.io.poses.inputs import read_compared
@@ -56,6 +57,21 @@ def test_a_chain_has_no_error_against_itself_nor_against_its_topic(bag: Path) ->
         found = evaluate(chain, read_poses(text), name="same")
         assert found.n == 8
         assert measures(found) == pytest.approx([0.0] * 4, abs=1e-5)
+
+
+def test_python_evaluates_trajectories_files_and_what_is_in_bags(bag: Path, tmp_path: Path) -> None:
+    chain = read_poses(f"{bag}#tf:map:base")
+    chain.write(tmp_path / "chain.txt")
+    for reference, estimate, name in (
+        (chain, tmp_path / "chain.txt", "chain"),
+        (str(tmp_path / "chain.txt"), chain, "estimate"),
+        # brought to the frame of the reference, as by `gvo compare`
+        (f"{bag}#/odom", f"{bag}#tf:map:cam", "tf:map:cam"),
+    ):
+        found = gvo.evaluate(reference, estimate)
+        assert (found.name, found.n) == (name, 8)
+        assert measures(found) == pytest.approx([0.0] * 4, abs=1e-5)
+    assert gvo.evaluate(chain, chain, name="mine").name == "mine"
 
 
 def test_poses_are_brought_to_the_frame_of_the_reference(bag: Path) -> None:
