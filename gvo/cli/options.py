@@ -123,7 +123,11 @@ def _topic(images: str) -> Any:  # noqa: ANN401 - has no public type
 def _recording_options(
     calibration: Annotated[
         list[Path] | None,
-        Option(metavar="FILE", help="Use this ROS, Kalibr or EuRoC YAML. May be repeated."),
+        Option(
+            metavar="FILE",
+            help="File of ROS, OpenCV, Kalibr, EuRoC, ORB-SLAM, stella_vslam, VINS, OpenVINS or "
+            "KITTI that replaces the recording's own. May be repeated.",
+        ),
     ] = None,
     left: Annotated[str | None, _topic("left")] = None,
     right: Annotated[str | None, _topic("right")] = None,

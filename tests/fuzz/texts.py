@@ -70,6 +70,39 @@ cam1:
   intrinsics: [457.6, 456.1, 379.9, 255.2]
   resolution: [752, 480]
 """
+_SLAM = (
+    b"""%YAML:1.0
+Camera.type: "KannalaBrandt8"
+Camera1.fx: 190.9
+Camera1.fy: 190.9
+Camera1.cx: 254.9
+Camera1.cy: 256.8
+Camera1.k1: 0.003
+Camera2.fx: 190.4
+Camera2.fy: 190.4
+Camera2.cx: 252.5
+Camera2.cy: 254.9
+Camera.width: 512
+Camera.height: 512
+Stereo.T_c1_c2: !!opencv-matrix
+  rows: 3
+  cols: 4
+  dt: f
+  data:[1, 0, 0, 0.1, 0, 1, 0, 0, 0, 0, 1, 0]
+""",
+    b"""Camera:
+  {model: perspective, fx: 61, fy: 61, cx: 24, cy: 16, cols: 48, rows: 32, focal_x_baseline: 6}
+StereoRectifier:
+  K_left: [61, 0, 24, 0, 61, 16, 0, 0, 1]
+  D_left: [0, 0, 0, 0]
+  K_right: [61, 0, 24, 0, 61, 16, 0, 0, 1]
+""",
+    b"""model_type: PINHOLE
+image_width: 48
+image_height: 32
+projection_parameters: {fx: 61, fy: 61, cx: 24, cy: 16}
+""",
+)
 _OPENCV = b"""%YAML:1.0
 ---
 LEFT.height: 480
@@ -266,7 +299,15 @@ def _calibration(data: bytes) -> None:
 
 
 _text = partial(Target, mutate=mutate_text)
-_CALIBRATIONS = [CALIBRATION, SENSOR % b"0", _KALIBR, _OPENCV, _INFO]
+_CALIBRATIONS = [
+    CALIBRATION,
+    SENSOR % b"0",
+    _KALIBR,
+    _OPENCV,
+    _INFO,
+    *_SLAM,
+    _P % (0, b"0") + _P % (1, b"-4"),
+]
 _CONFIGURATIONS = [b"images:\n  black: 3\nwindow: {size: 4}\n"]
 _WORDS = [b"tf:odom:base", b"/odom", b"topic:odom", b"0.1,0.02", b"1,2,3,0,0,0,1"]
 _SETTINGS = [b"window.n_links=3", b"klt.n_corners=300\nsync.stamps=recording"]

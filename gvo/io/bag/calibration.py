@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from gvo.errors import CalibrationError, RecordingError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration, rectification_maps
-from gvo.io.bag.cameras import BagCamera, image_frame, read_bag_cameras, recorded_depth_scale
+from gvo.io.bag.cameras import (
+    BagCamera,
+    image_frame,
+    image_size,
+    read_bag_cameras,
+    recorded_depth_scale,
+)
 from gvo.io.bag.messages import transform_of
 from gvo.io.bag.reader import BagMessage, MessageReader
 from gvo.io.bag.topics import CameraTopics
@@ -84,10 +91,15 @@ def calibrations_of_messages(
 
 
 def calibrations_of_file(
-    paths: CalibrationPaths, topics: CameraTopics, reader: MessageReader | None = None
+    paths: CalibrationPaths, topics: CameraTopics, reader: MessageReader
 ) -> BagCalibration:
     """Read the calibration from files; the topics' names tell whether the images are rectified."""
-    found = read_cameras(paths, sensor=topics.sensor, is_rectified=topics.first.is_rectified)
+    found = read_cameras(
+        paths,
+        sensor=topics.sensor,
+        is_rectified=topics.first.is_rectified,
+        image_size=partial(image_size, reader, topics.first),
+    )
     decisions = [f"calibration: {found.origin}"]
     if topics.first.is_rectified and not found.calibrations[0].is_rectified:
         decisions[0] += "; the images are taken as raw, as there, whatever the topics are called"
@@ -98,7 +110,7 @@ def calibrations_of_file(
         calibrations=found.calibrations,
         decisions=tuple(decisions),
         depth_scale=found.depth_scale,
-        frame_id="" if reader is None else image_frame(reader, topics.first),
+        frame_id=image_frame(reader, topics.first),
         T_body_cam=found.T_body_cam,
     )
 

@@ -208,7 +208,7 @@ def _bag_camera(
     fields = camera_fields(message, f"{where}: {name}")
     notes: tuple[str, ...] = ()
     if 0 in fields.recorded_size():
-        width, height = _image_size(reader, image, where)
+        width, height = image_size(reader, image)
         binning_x, binning_y = fields.binning_factors
         fields = replace(
             fields,
@@ -222,7 +222,7 @@ def _bag_camera(
     )
 
 
-def _image_size(reader: MessageReader, image: Topic, where: str) -> tuple[int, int]:
+def image_size(reader: MessageReader, image: Topic) -> tuple[int, int]:
     """Return width and height of the first image that can be read."""
     for message in reader.messages([image.name]):
         with suppress(RecordingError):
@@ -235,8 +235,8 @@ def _image_size(reader: MessageReader, image: Topic, where: str) -> tuple[int, i
                 height, width = decode_compressed(content, image.name).shape[:2]
             return width, height
     raise CalibrationError(
-        f"{where}: the CameraInfo of {image.name} leaves width and height 0, and none of its "
-        "images can be read; give --calibration FILE"
+        f"{image.name}: its calibration leaves width and height out, and none of its images can "
+        "be read; give --calibration FILE with the size"
     )
 
 

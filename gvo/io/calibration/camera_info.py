@@ -22,11 +22,12 @@ MAX_SIDE_PX = 32767
 """Largest width or height of an image, pixels: what OpenCV rectifies."""
 ROTATION_TOLERANCE = 1e-3
 """Largest deviation of R R^T from the identity that is the rounding of a file."""
-# As ROS, Kalibr, EuRoC and librealsense call them, in lower case, words joined by _.
+# As systems and drivers call them, in lower case, words joined by _.
 _MODELS: dict[str, DistortionModel] = {
     **dict.fromkeys(("plumb_bob", "radtan", "radial_tangential", "brown_conrady"), "plumb_bob"),
-    "rational_polynomial": "rational_polynomial",
-    **dict.fromkeys(("equidistant", "fisheye"), "equidistant"),
+    **dict.fromkeys(("radialtangential", "pinhole", "perspective", "rectified"), "plumb_bob"),
+    **dict.fromkeys(("rational_polynomial", "pinhole_full"), "rational_polynomial"),
+    **dict.fromkeys(("equidistant", "fisheye", "kannalabrandt8"), "equidistant"),
     **dict.fromkeys(("kannala_brandt", "kannala_brandt4"), "equidistant"),
 }
 _MAX_ANGLE_RAD = 1e-3
@@ -211,15 +212,10 @@ def read_array(values: object, shape: tuple[int, ...], what: str) -> FloatArray:
 
 def _distortion(fields: CameraFields, *, is_rectified: bool) -> tuple[DistortionModel, FloatArray]:
     D = read_numbers(fields.D, f"{fields.where}: D")
-    model = _MODELS.get("_".join(fields.model.lower().replace("-", " ").split()))
-    is_meant = fields.is_distorted_by_zeros and model == "equidistant"
+    is_meant = fields.is_distorted_by_zeros and known_model(fields.model) == "equidistant"
     if is_rectified or not (np.any(D) or is_meant):
         return "plumb_bob", np.zeros(5)
-    if model is None:
-        raise CalibrationError(
-            f"{fields.where}: distortion model {shortened(fields.model)} is not supported, "
-            "expected plumb_bob, rational_polynomial or equidistant; rectify the images first"
-        )
+    model = supported_model(fields.model, fields.where)
     if model == "plumb_bob" and D.size > 5:
         model = "rational_polynomial"  # OpenCV goes by the count alone, and ROS with it
     counts = {4, 5, *N_COEFFICIENTS[model]} if model != "equidistant" else {4}
@@ -232,6 +228,23 @@ def _distortion(fields: CameraFields, *, is_rectified: bool) -> tuple[Distortion
         )
     n_missing = max(N_COEFFICIENTS[model][0] - D.size, 0)
     return model, np.concatenate([D, np.zeros(n_missing)])
+
+
+def supported_model(name: str, where: str) -> DistortionModel:
+    """Return the model that a system calls so; refuse others."""
+    model = known_model(name)
+    if model is None:
+        raise CalibrationError(
+            f"{where}: distortion model {shortened(name)} is not supported, expected plumb_bob "
+            "(pinhole, radtan), rational_polynomial or equidistant (fisheye, Kannala-Brandt); "
+            "rectify the images first"
+        )
+    return model
+
+
+def known_model(name: str) -> DistortionModel | None:
+    """Return the model that a system calls so; None if it is not supported."""
+    return _MODELS.get("_".join(name.lower().replace("-", " ").split()))
 
 
 def _alternatives(counts: set[int]) -> str:

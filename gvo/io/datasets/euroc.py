@@ -14,10 +14,10 @@ from gvo.io.calibration.files import (
     CameraSet,
     paths_of,
     pose_of_rectified,
-    read_calibration_file,
     read_cameras,
 )
-from gvo.io.datasets.files import FolderSource, StampedPath, read_stamped_rows
+from gvo.io.calibration.forms import read_calibration_file
+from gvo.io.datasets.files import FolderSource, StampedPath, image_size, read_stamped_rows
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
@@ -51,7 +51,8 @@ class EurocSource(FolderSource):
         images = {name: _list_images(self._root / name) for name in ("cam0", "cam1")}
         sensors = [self._root / name / "sensor.yaml" for name in images]
         files = paths_of(calibration, *sensors)
-        cameras = read_cameras(files, sensor="stereo", is_rectified=False)
+        size = image_size(images["cam0"], config)
+        cameras = read_cameras(files, sensor="stereo", is_rectified=False, image_size=size)
         rectification = "from T_BS and distortion of cam0 and cam1"
         if calibration:
             key = "R and P" if cameras.baseline_from == "P" else cameras.baseline_from

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gvo._text import cut, text_lines
 from gvo.config import Config
 from gvo.errors import RecordingError
-from gvo.io.calibration.files import CameraSet
+from gvo.io.calibration.files import CameraSet, ImageSize
 from gvo.io.images import GreyRange, read_image
 from gvo.io.recording import RecordingInfo, Sensor, StampedImage, shown
 from gvo.trajectory.trajectory import parse_stamp
@@ -87,6 +87,26 @@ def loader(config: Config | None) -> Load:
     """Return what loads a grey or colour image, its 16 bits reduced as configured."""
     images = (config or Config()).images
     return partial(read_image, grey_range=GreyRange(black=images.black, white=images.white))
+
+
+def image_size(rows: Sequence[StampedPath], config: Config | None) -> ImageSize:
+    """Return what reads width and height of the first image that can be read."""
+    return partial(_image_size, rows, loader(config))
+
+
+def _image_size(rows: Sequence[StampedPath], load: Load) -> tuple[int, int]:
+    first_fault = ""
+    for _, path in rows:
+        try:
+            height, width = load(Path(path)).shape[:2]
+        except RecordingError as error:
+            first_fault = first_fault or str(error)
+            continue  # it becomes a faulty frame later
+        return width, height
+    folder = Path(rows[0][1]).parent
+    raise RecordingError(
+        f"{folder}: none of its {len(rows)} images can be read; the first: {first_fault}"
+    )
 
 
 def _stream(stream: int, rows: Sequence[StampedPath], load: Load) -> Iterator[StampedImage]:

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from gvo._text import cut, plain_number
 from gvo.config import Config
-from gvo.errors import CalibrationError, RecordingError
+from gvo.errors import RecordingError
 from gvo.geometry import se3
-from gvo.io.calibration.camera_info import check_camera, rectified_calibration, stereo_baseline
-from gvo.io.calibration.files import CalibrationPaths, CameraSet, paths_of, read_cameras
-from gvo.io.datasets.files import FolderSource, StampedPath, loader, read_rows, read_stamped_rows
+from gvo.io.calibration.camera_info import stereo_baseline
+from gvo.io.calibration.files import CalibrationPaths, paths_of, read_cameras
+from gvo.io.datasets.files import FolderSource, StampedPath, image_size, read_stamped_rows
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import FloatArray
 
 _PAIRS = (("image_0", "image_1"), ("image_2", "image_3"))
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -53,11 +50,13 @@ class KittiSource(FolderSource):
         names = _find_pair(folder)
         images = {name: self._list_images(name) for name in names}
         files = paths_of(calibration, folder / "calib.txt")
-        if calibration:
-            cameras = read_cameras(files, sensor="stereo", is_rectified=True)
-        else:
-            size = _image_size([path for _, path in images[names[0]]], config)
-            cameras = _read_cameras(files[0], names, size)
+        cameras = read_cameras(
+            files,
+            sensor="stereo",
+            is_rectified=True,
+            image_size=image_size(images[names[0]], config),
+            first=int(names[0][-1]),
+        )
         P = cameras.calibrations[0].P
         # The centre of the camera in the frame of cam0: P = K [I | -centre].
         self._t_cam0_cam = np.asarray(-np.linalg.solve(P[:, :3], P[:, 3]))
@@ -114,48 +113,3 @@ def _find_pair(folder: Path) -> tuple[str, str]:
         if all((folder / name).is_dir() for name in pair):
             return pair
     raise RecordingError(f"{folder}: expected image_0 and image_1, or image_2 and image_3")
-
-
-def _image_size(paths: Sequence[str], config: Config | None) -> tuple[int, int]:
-    """Return width and height of the first image that can be read."""
-    first_fault = ""
-    for path in paths:
-        try:
-            height, width = loader(config)(Path(path)).shape[:2]
-        except RecordingError as error:
-            first_fault = first_fault or str(error)
-            continue  # it becomes a faulty frame later
-        return width, height
-    folder, n_images = Path(paths[0]).parent, len(paths)
-    raise RecordingError(
-        f"{folder}: none of its {n_images} images can be read; the first: {first_fault}"
-    )
-
-
-def _read_cameras(path: Path, names: tuple[str, str], size: tuple[int, int]) -> CameraSet:
-    projections = _read_projections(path)
-    calibrations = []
-    for key in (f"P{name[-1]}" for name in names):
-        if key not in projections:
-            raise CalibrationError(f"{path}: lacks {key}")
-        calibration = rectified_calibration(projections[key], width=size[0], height=size[1])
-        check_camera(calibration, f"{path}: {key}")
-        calibrations.append(calibration)
-    return CameraSet(calibrations=tuple(calibrations), origin=str(path))
-
-
-def _read_projections(path: Path) -> dict[str, FloatArray]:
-    projections = {}
-    for number, fields in read_rows(path, n_fields=1):
-        if not fields[0].startswith("P"):
-            continue
-        try:
-            projection = np.array([float(plain_number(field)) for field in fields[1:]])
-        except ValueError as error:
-            raise CalibrationError(f"{path}, line {number}: {cut(str(error), 300)}") from error
-        if projection.size != 12 or not np.all(np.isfinite(projection)):
-            raise CalibrationError(
-                f"{path}, line {number}: expected 12 finite numbers, got {projection.size}"
-            )
-        projections[fields[0].rstrip(":")] = projection.reshape(3, 4)
-    return projections

@@ -13,8 +13,8 @@ import numpy as np
 from gvo.config import Config
 from gvo.errors import CalibrationError, RecordingError
 from gvo.geometry.camera import Calibration
-from gvo.io.calibration.files import CalibrationPaths, CameraSet, paths_of, read_cameras
-from gvo.io.datasets.files import FolderSource, StampedPath, read_stamped_rows
+from gvo.io.calibration.files import CalibrationPaths, CameraSet, ImageSize, paths_of, read_cameras
+from gvo.io.datasets.files import FolderSource, StampedPath, image_size, read_stamped_rows
 from gvo.io.images import MILLIMETRES, read_depth
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
@@ -69,7 +69,9 @@ class TumSource(FolderSource):
     ) -> None:
         self._folder = folder
         images = {name: _list_images(folder / f"{name}.txt") for name in ("rgb", "depth")}
-        cameras = _find_calibration(folder, paths_of(calibration))
+        cameras = _find_calibration(
+            folder, paths_of(calibration), image_size(images["rgb"], config)
+        )
         configured = (config or Config()).depth.scale
         if configured is not None:
             scale, reason = configured, "by depth.scale"
@@ -93,7 +95,7 @@ def _list_images(table: Path) -> list[StampedPath]:
     return [(stamp_ns, str(table.parent / name)) for stamp_ns, name in rows]
 
 
-def _find_calibration(folder: Path, explicit: tuple[Path, ...]) -> CameraSet:
+def _find_calibration(folder: Path, explicit: tuple[Path, ...], size: ImageSize) -> CameraSet:
     beside = folder / "calibration.yaml"
     named = _CAMERA_NAME.search(folder.resolve().name.lower())
     if not explicit and named is not None:
@@ -108,7 +110,7 @@ def _find_calibration(folder: Path, explicit: tuple[Path, ...]) -> CameraSet:
             "freiburg3; add calibration.yaml or give --calibration FILE"
         )
     paths = explicit or (beside,)
-    cameras = read_cameras(paths, sensor="rgbd", is_rectified=False)
+    cameras = read_cameras(paths, sensor="rgbd", is_rectified=False, image_size=size)
     return replace(cameras, origin=" + ".join(path.name for path in paths))
 
 

@@ -11,13 +11,9 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from gvo.errors import CalibrationError
-from gvo.geometry.camera import Calibration, rectify_stereo
-from gvo.io.calibration.files import (
-    CalibrationPaths,
-    CameraSet,
-    read_calibration_file,
-    read_cameras,
-)
+from gvo.geometry.camera import Calibration, rectification_maps, rectify_stereo
+from gvo.io.calibration.files import CalibrationPaths, CameraSet, read_cameras
+from gvo.io.calibration.forms import read_calibration_file
 from gvo.types import FloatArray
 
 _SIZE = (752, 480)
@@ -39,8 +35,11 @@ def _write(path: Path, content: object) -> Path:
     return path
 
 
-def _stereo(paths: CalibrationPaths, *, is_rectified: bool = False) -> CameraSet:
-    return read_cameras(paths, sensor="stereo", is_rectified=is_rectified)
+def _stereo(
+    paths: CalibrationPaths, *, is_rectified: bool = False, size: tuple[int, int] | None = None
+) -> CameraSet:
+    image_size = None if size is None else lambda: size
+    return read_cameras(paths, sensor="stereo", is_rectified=is_rectified, image_size=image_size)
 
 
 def _rgbd(paths: CalibrationPaths) -> CameraSet:
@@ -112,6 +111,101 @@ def _kalibr(path: Path, model: str, **changes: Any) -> Path:
     return _write(path, chain)
 
 
+def _openvins(folder: Path, model: str) -> Path:
+    """Write a chain that tells where the cameras are in the IMU, and what names it."""
+    chain = yaml.safe_load(_kalibr(folder / "kalibr_imucam_chain.yaml", model).read_text())
+    del chain["cam1"]["T_cn_cnm1"]
+    for camera in chain.values():
+        camera["T_imu_cam"] = np.linalg.inv(camera.pop("T_cam_imu")).tolist()
+    text = f"%YAML:1.0 # need to specify the file type at the top!\n{yaml.safe_dump(chain)}"
+    _write(folder / "kalibr_imucam_chain.yaml", text)
+    names = 'relative_config_imu: "imu.yaml"\nrelative_config_imucam: "kalibr_imucam_chain.yaml"\n'
+    return _write(folder / "estimator_config.yaml", f"%YAML:1.0\n\nuse_fej: true\n{names}")
+
+
+def _matrix(T: Any) -> str:
+    """Return a matrix as systems write it for OpenCV: no blank, several lines."""
+    T = np.atleast_2d(T)
+    rows = ",\n           ".join(", ".join(map(repr, row)) for row in T.tolist())
+    shape = f"   rows: {T.shape[0]}\n   cols: {T.shape[1]}\n   dt: d\n"
+    return f"!!opencv-matrix\n{shape}   data:[{rows}]\n"
+
+
+def _numbers(model: str, side: int, start: str = "") -> str:
+    """Return fx to k4, a line each, that begins so."""
+    K = _K[side]
+    values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    names = ["k1", "k2", "p1", "p2"] if model == "plumb_bob" else ["k1", "k2", "k3", "k4"]
+    values |= dict(zip(names, _D[model][side], strict=True))
+    return "".join(f"{start}{name}: {float(value)!r}\n" for name, value in values.items())
+
+
+def _orb_slam3(path: Path, model: str, *, is_old: bool = False) -> Path:
+    """Write the settings of ORB-SLAM3: of version 1, or those before, which lack the size."""
+    kind = "PinHole" if model == "plumb_bob" else "KannalaBrandt8"
+    T_body_left, T_body_right = _poses()
+    T = np.linalg.inv(T_body_left) @ T_body_right
+    text = f'%YAML:1.0\n\nCamera.type: "{kind}"\nViewer.PointSize:2\nCamera.RGB: 1\n'
+    text += _numbers(model, 0, "Camera." if is_old else "Camera1.")
+    text += _numbers(model, 1, "Camera2.")
+    if is_old:
+        return _write(path, f"{text}Tlr: {_matrix(T[:3])}Camera.bf: 19.3\n")
+    size = f"Camera.width: {_SIZE[0]}\nCamera.height: {_SIZE[1]}\nCamera.newWidth: 600\n"
+    return _write(path, f"{text}{size}Stereo.ThDepth: 60.0\nStereo.T_c1_c2: {_matrix(T)}")
+
+
+def _orb_slam2(path: Path, model: str) -> Path:
+    """Write the settings of ORB-SLAM2 of a pair that it rectifies."""
+    K = _rig(model)[0].P
+    text = f"%YAML:1.0\nCamera.fx: {K[0, 0]!r}\nCamera.fy: {K[0, 0]!r}\nCamera.width: {_SIZE[0]}\n"
+    for side, camera in zip(("LEFT", "RIGHT"), _rig(model), strict=True):
+        text += f"{side}.height: {_SIZE[1]}\n{side}.width: {_SIZE[0]}\n"
+        text += "".join(f"{side}.{name}: {_matrix(getattr(camera, name))}" for name in "DKRP")
+    return _write(path, text)
+
+
+def _stella(path: Path, model: str, *, is_dotted: bool = False) -> Path:
+    """Write the settings of stella_vslam, or of OpenVSLAM before it, with dots."""
+    cameras = _rig(model)
+    P = cameras[0].P
+    camera: dict[str, Any] = {"name": "pair", "setup": "stereo", "model": "perspective"}
+    camera |= {"fx": P[0, 0], "fy": P[1, 1], "cx": P[0, 2], "cy": P[1, 2], "k1": 0.0}
+    camera |= {"cols": _SIZE[0], "rows": _SIZE[1]}
+    camera["focal_x_baseline"] = -cameras[1].P[0, 3]
+    rectifier: dict[str, Any] = {} if model == "plumb_bob" else {"model": "fisheye"}
+    for side, each in zip(("left", "right"), cameras, strict=True):
+        rectifier |= {f"{name}_{side}": getattr(each, name).ravel().tolist() for name in "KDR"}
+    parts = {"Camera": camera, "StereoRectifier": rectifier}
+    parts = {
+        name: {k: v if isinstance(v, str | int | list) else float(v) for k, v in part.items()}
+        for name, part in parts.items()
+    }
+    if is_dotted:
+        return _write(path, {f"{n}.{k}": v for n, part in parts.items() for k, v in part.items()})
+    return _write(path, parts)
+
+
+def _vins(folder: Path, model: str) -> Path:
+    """Write the configuration of VINS-Fusion and the cameras that it names."""
+    text = "%YAML:1.0\n\nimu: 0\nnum_of_cam: 2\n"
+    for n, T in enumerate(_poses()):
+        camera = f"%YAML:1.0\n---\nimage_width: {_SIZE[0]}\nimage_height: {_SIZE[1]}\n"
+        lines = _numbers(model, n, "   ").splitlines(keepends=True)
+        if model == "equidistant":
+            names = ("mu", "mv", "u0", "v0", "k2", "k3", "k4", "k5")
+            lines = [
+                f"   {name}:{line.partition(':')[2]}"
+                for name, line in zip(names, lines, strict=True)
+            ]
+            camera += f"model_type: KANNALA_BRANDT\nprojection_parameters:\n{''.join(lines)}"
+        else:
+            camera += f"model_type: PINHOLE\ndistortion_parameters:\n{''.join(lines[4:])}"
+            camera += f"projection_parameters:\n{''.join(lines[:4])}"
+        _write(folder / f"cam{n}_pinhole.yaml", camera)
+        text += f'cam{n}_calib: "cam{n}_pinhole.yaml"\nbody_T_cam{n}: {_matrix(T)}'
+    return _write(folder / "stereo_config.yaml", text)
+
+
 def _ros(model: str, side: int) -> dict[str, Any]:
     camera = _rig(model)[side]
     matrices = {
@@ -155,11 +249,19 @@ def test_the_files_of_one_rig_give_one_calibration(tmp_path: Path, model: str) -
         "kalibr with an imu": _kalibr(tmp_path / "imucam.yaml", model, T_cn_cnm1=None),
         "two of ros": sides,
         "left and right": _write(tmp_path / "pair.yaml", both),
+        "openvins": _openvins(tmp_path / "openvins", model),
+        "its chain": tmp_path / "openvins" / "kalibr_imucam_chain.yaml",
+        "vins": _vins(tmp_path / "vins", model),
+        "orb-slam3": _orb_slam3(tmp_path / "orb3.yaml", model),
+        "orb-slam3 before version 1": _orb_slam3(tmp_path / "old.yaml", model, is_old=True),
+        "stella_vslam": _stella(tmp_path / "stella.yaml", model),
+        "openvslam": _stella(tmp_path / "openvslam.yaml", model, is_dotted=True),
     }
     if model == "plumb_bob":
         sets["opencv"] = _opencv(tmp_path / "opencv.yaml", model)
+        sets["orb-slam2"] = _orb_slam2(tmp_path / "orb2.yaml", model)
     for name, paths in sets.items():
-        found = _stereo(paths)
+        found = _stereo(paths, size=_SIZE)
         for calibration, expected in zip(found.calibrations, _rig(model), strict=True):
             assert (calibration.width, calibration.height) == _SIZE
             assert calibration.model == model
@@ -221,6 +323,82 @@ def test_of_a_chain_of_four_cameras_the_first_two_are_the_pair(tmp_path: Path) -
     found = _stereo(_write(path, longer)).pair
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_array_equal(one.P, other.P)
+
+
+_ONE = "fx: 50.0\nfy: 51.0\ncx: 23.5\ncy: 15.5\n"
+_P = "50 0 23.5 {} 0 51 15.5 0 0 0 1 0"
+
+
+def _dotted(start: str, text: str = _ONE) -> str:
+    return "".join(f"{start}{line}" for line in text.splitlines(keepends=True))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f'%YAML:1.0\nCamera.type: "Rectified"\n{_dotted("Camera1.")}Stereo.b: 0.4\n',
+        f"%YAML:1.0\n{_dotted('Camera.')}Camera.k1: 0.0\nCamera.bf: 20.0\nCamera.width: 48\n",
+        f"Camera:\n  model: perspective\n{_dotted('  ')}  cols: 48\n  focal_x_baseline: 20\n",
+        f"P0: {_P.format(0)}\nP1: {_P.format(-20)}\nP2: {_P.format(1)}\nTr: 1 0 0\n",
+        f"calib_time: 09-Jan-2012 13:57\nP_rect_00: {_P.format(0)}\nP_rect_01: {_P.format(-20)}\n",
+    ],
+)
+def test_a_rectified_camera_and_its_baseline_are_a_pair(tmp_path: Path, text: str) -> None:
+    path = _write(tmp_path / "camera.txt", text)
+    for is_rectified in (False, True):
+        left, right = _stereo(path, is_rectified=is_rectified, size=(48, 32)).pair
+        assert (left.width, left.height, left.K[1, 1]) == (48, 32, 51.0)
+        np.testing.assert_array_equal(left.P, [[50, 0, 23.5, 0], [0, 51, 15.5, 0], [0, 0, 1, 0]])
+        assert right.P[0, 3] == pytest.approx(-20.0)
+        assert (rectification_maps(left), rectification_maps(right)) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("text", "scale"),
+    [
+        (f"%YAML:1.0\n{_dotted('Camera1.')}Stereo.b: 0.07\nRGBD.DepthMapFactor: 5000.0", 5000.0),
+        (f"%YAML:1.0\n{_dotted('Camera.')}Camera.bf: 40.0\nDepthMapFactor: 1.0", None),
+        (
+            f"Camera:\n  setup: RGBD\n{_dotted('  ')}Preprocessing:\n  depthmap_factor: 1000.0",
+            1000.0,
+        ),
+        (f"{_dotted('Camera.')}Camera.setup: RGBD\ndepthmap_factor: 5000.0", 5000.0),
+    ],
+)
+def test_an_rgbd_camera_has_the_factor_of_its_depth(
+    tmp_path: Path, text: str, scale: float | None
+) -> None:
+    path = _write(tmp_path / "c.yaml", text)
+    found = read_cameras(path, sensor="rgbd", is_rectified=False, image_size=lambda: (48, 32))
+    assert found.depth_scale == scale
+    assert (found.calibrations[0].width, found.calibrations[0].K[0, 2]) == (48, 23.5)
+    with pytest.raises(CalibrationError, match=r"c\.yaml.* lacks width and height"):
+        _rgbd(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (f"Camera:\n  model: equirectangular\n{_dotted('  ')}", "stella_vslam.*'equirectangular'"),
+        ("model_type: MEI\nprojection_parameters:\n  gamma1: 9.0\n", "model 'MEI' is not supp"),
+        ("Camera.type: PinHole\nCamera.fx: 9.0\n", "ORB-SLAM: lacks .* fy, cx, cy"),
+        (f"{_dotted('Camera1.')}", "holds one camera.*Stereo.b, Camera.bf"),
+        ("cam0_calib: none.yaml", r"none\.yaml: does not exist; c\.yaml names it"),
+        ("cam0_calib: c.yaml", "not a calibration that gvo knows"),
+        ("relative_config_imucam: [c.yaml]", "does not exist"),
+        ('relative_config_imucam: "\\0"', "does not exist"),
+        ("value0: {T_imu_cam: []}", "not a calibration .* ORB-SLAM, stella_vslam, VINS, OpenVINS"),
+        (f"{_dotted('Camera.')}Camera.bf: x\n", "bf must hold numbers"),
+        ("Camera: 1\n", "ORB-SLAM: lacks"),
+        ("Camera: 1\nCamera.fx: 1\n", "ORB-SLAM: lacks"),
+        ("P0: 1 2\nP1: 1 2\n", "P0: P must hold 12 numbers, got 2"),
+    ],
+)
+def test_what_is_not_supported_is_refused_by_name(tmp_path: Path, text: str, message: str) -> None:
+    path = _write(tmp_path / "c.yaml", text)
+    with pytest.raises(CalibrationError, match=message) as caught:
+        _stereo(path, size=(48, 32))
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("header", ["%YAML:1.0", "%YAML 1.2"])
@@ -286,8 +464,8 @@ def test_a_stereo_pair_is_two_cameras(tmp_path: Path, tiny: Any) -> None:
     [
         ({"camera_model": "omni"}, "camera model 'omni' is not supported, expected pinhole"),
         ({"intrinsics": [1.0, 2.0]}, "intrinsics must hold 4 numbers, got 2"),
-        ({"intrinsics": None, "camera_model": "pinhole"}, "lacks image_width"),
-        ({"resolution": None}, "resolution must hold 2 numbers, it is missing"),
+        ({"intrinsics": None, "camera_model": "pinhole"}, "lacks camera_matrix, intrinsics or fx,"),
+        ({"resolution": None}, "lacks width and height of the images"),
         ({"resolution": [1280, 480]}, "752x480 and 1280x480"),
         ({"T_cn_cnm1": [[1.0] * 4] * 4}, "T_cn_cnm1 must have .0, 0, 0, 1. as its last row"),
         ({"T_cn_cnm1": [[1.0, 0.0]]}, "T_cn_cnm1 must hold 16 numbers, got 2"),

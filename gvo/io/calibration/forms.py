@@ -1,0 +1,374 @@
+"""Forms of calibration files, by the systems that write them: which a file has, its cameras."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import yaml
+
+from gvo._text import MAX_CHARACTERS, YamlError, access_fault, load_yaml, read_text, shortened
+from gvo.errors import CalibrationError, named_faults
+from gvo.geometry import se3
+from gvo.io.calibration.camera_info import (
+    ROTATION_TOLERANCE,
+    CameraFields,
+    RegionOfInterest,
+    known_model,
+    read_array,
+    read_numbers,
+    supported_model,
+)
+from gvo.types import FloatArray
+
+Content: TypeAlias = Mapping[Any, Any]
+
+_OPENCV_MATRIX = "tag:yaml.org,2002:opencv-matrix"
+# OpenCV also reads `data:[0]` and `PointSize:2`, as the files of ORB-SLAM have them.
+_KEY_WITHOUT_BLANK = re.compile(r"^(\s*[\w.]+):(?=\S)", re.MULTILINE)
+_KITTI_ROW = re.compile(r"^P(?:_rect_0)?([0-9]):?[ \t](.*)$", re.MULTILINE)
+_CHAIN = re.compile(r"cam([0-9]{1,3})")
+_KNOWN = (
+    "expected a file of ROS (camera_info), OpenCV, Kalibr (camchain), EuRoC (sensor.yaml), "
+    "ORB-SLAM, stella_vslam, VINS, OpenVINS or KITTI (P0, P1)"
+)
+_KEYS = {
+    "width": ("image_width", "width", "cols"),
+    "height": ("image_height", "height", "rows"),
+    "model": ("distortion_model", "model_type", "model", "type"),
+    "K": ("camera_matrix", "K", "k"),
+    "D": ("distortion_coefficients", "distortion_coeffs", "D", "d"),
+    "R": ("rectification_matrix", "R", "r"),
+    "P": ("projection_matrix", "P", "p"),
+}
+_PINHOLE = ("fx", "fy", "cx", "cy")
+_RADIAL_TANGENTIAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_FISHEYE = ("k1", "k2", "k3", "k4")
+# What VINS calls them of a fisheye.
+_OF_KANNALA_BRANDT = dict(
+    zip(("mu", "mv", "u0", "v0", "k2", "k3", "k4", "k5"), _PINHOLE + _FISHEYE, strict=True)
+)
+# By their keys whether they map the other way round.
+_TO_BODY = {"T_BS": False, "T_cam_imu": True, "T_imu_cam": False}
+_FROM_PREVIOUS = {"T_cn_cnm1": False, "T_c1_c2": True, "Tlr": True}
+_COMMON = ("type", "width", "height")
+_DEPTH_KEYS = ("depth_scale", "DepthMapFactor", "depthmap_factor")
+_MAX_COUNT = 2**31 - 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DescribedCamera:
+    """A camera of a calibration file.
+
+    Parameters
+    ----------
+    fields : CameraFields
+        As they stand there, not checked; width and height 0 where the file does not say them.
+    T_body_cam : ndarray of float64, shape (4, 4), optional
+        Maps the raw camera to the body (EuRoC: T_BS, Kalibr: the inverse of T_cam_imu), metres.
+    T_cam_previous : ndarray of float64, shape (4, 4), optional
+        Maps the raw camera before it in a chain to this one (Kalibr: T_cn_cnm1), metres.
+    focal_x_baseline : float, optional
+        Of a rectified pair whose cameras are both like this one, pixels times metres.
+    """
+
+    fields: CameraFields
+    T_body_cam: FloatArray | None = None
+    T_cam_previous: FloatArray | None = None
+    focal_x_baseline: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CalibrationFile:
+    """One camera, a pair or a chain; and the counts per metre of integer depth."""
+
+    cameras: tuple[DescribedCamera, ...]
+    depth_scale: float | None = None
+
+
+def read_calibration_file(path: Path) -> CalibrationFile:
+    """Read a calibration file in any form of `FORMS`, or with the rows P0, P1, ... of KITTI.
+
+    It may hold the counts per metre of depth: `depth_scale`, or what ORB-SLAM and stella_vslam
+    call their factor.
+    """
+    text = _read(path)
+    rows = sorted(_KITTI_ROW.findall(text))
+    if rows:
+        cameras = [_described({"P": row.split()}, f"{path}: P{n}") for n, row in rows]
+        return CalibrationFile(cameras=tuple(cameras))
+    content = _load(text, path)
+    return CalibrationFile(
+        cameras=_cameras(content, path, FORMS), depth_scale=_depth_scale(content, path)
+    )
+
+
+def _cameras(content: Content, path: Path, forms: Iterable[Form]) -> tuple[DescribedCamera, ...]:
+    for key, read in forms:
+        if any(re.fullmatch(key, str(each)) for each in content):
+            return tuple(read(content, path))
+    raise CalibrationError(f"{path}: not a calibration that gvo knows: {_KNOWN}")
+
+
+def _of_vins(content: Content, path: Path) -> Iterable[DescribedCamera]:
+    """Read the cameras of VINS-Fusion in files of their own, and their poses on the body."""
+    for n in range(2):
+        if f"cam{n}_calib" in content:
+            camera = _elsewhere(path, content[f"cam{n}_calib"])[0]
+            T_body_cam = _transform(content, {f"body_T_cam{n}": False}, str(path))
+            yield replace(camera, T_body_cam=T_body_cam)
+
+
+def _of_estimator(content: Content, path: Path) -> Iterable[DescribedCamera]:
+    """Read the chain that the configuration of OpenVINS names."""
+    return _elsewhere(path, content["relative_config_imucam"])
+
+
+def _elsewhere(path: Path, name: object) -> tuple[DescribedCamera, ...]:
+    """Read the file that another names, which must not name a third."""
+    other = path.parent / str(name)
+    if fault := access_fault(other):
+        raise CalibrationError(f"{other}: {fault}; {path.name} names it: put it there")
+    return _cameras(_load(_read(other), other), other, FORMS[2:])
+
+
+def _of_chain(content: Content, path: Path) -> Iterable[DescribedCamera]:
+    chain = {int(match[1]): key for key in content if (match := _CHAIN.fullmatch(str(key)))}
+    return [_described(content[chain[n]], f"{path}: {chain[n]}") for n in sorted(chain)]
+
+
+def _of_pair(content: Content, path: Path) -> Iterable[DescribedCamera]:
+    names = ("left", "right") if "left" in content else ("LEFT", "RIGHT")
+    return [_described(content.get(name), f"{path}: {name}") for name in names]
+
+
+def _of_slam(content: Content, path: Path) -> Iterable[DescribedCamera]:
+    """Read the camera of ORB-SLAM or stella_vslam, and the right one where it has its own."""
+    camera, second = _part(content, "Camera"), _part(content, "Camera2")
+    where = f"{path}: Camera of {'stella_vslam' if 'model' in camera else 'ORB-SLAM'}"
+    stereo = {"Tlr": content["Tlr"]} if "Tlr" in content else _part(content, "Stereo")
+    yield _described(camera | _part(content, "Camera1") | stereo, where)
+    if "fx" in second:
+        common = {key: camera[key] for key in _COMMON if key in camera}
+        yield _described(common | stereo | second, f"{path}: Camera2")
+
+
+def _of_rectifier(content: Content, path: Path) -> Iterable[DescribedCamera]:
+    """Read the raw pair that stella_vslam rectifies to its camera."""
+    camera, *_ = _of_slam(content, path)
+    rectifier, fields = _part(content, "StereoRectifier"), camera.fields
+    for side, factor in (("left", 0.0), ("right", -1.0)):
+        offset = [[factor * (camera.focal_x_baseline or 0.0)], [0.0], [0.0]]
+        raw = {str(key).removesuffix(f"_{side}"): value for key, value in rectifier.items()}
+        P = np.hstack([np.reshape(fields.K, (3, 3)), offset])
+        raw |= {"P": P, "resolution": (fields.width, fields.height)}
+        yield _described(raw, f"{path}: {side} of StereoRectifier")
+
+
+def _of_one(content: Content, path: Path) -> Iterable[DescribedCamera]:
+    """Read one camera; VINS has its numbers in parts."""
+    numbers = _part(content, "projection_parameters") | _part(content, "distortion_parameters")
+    if content.get("model_type") == "KANNALA_BRANDT":
+        numbers = {_OF_KANNALA_BRANDT.get(key, key): value for key, value in numbers.items()}
+    return [_described({**content, **numbers}, str(path))]
+
+
+def _part(content: Content, name: str) -> dict[Any, Any]:
+    """Return the keys under a name; empty if there are none."""
+    part = content.get(name)
+    return dict(part) if isinstance(part, Mapping) else {}
+
+
+def _described(content: object, where: str) -> DescribedCamera:
+    if not isinstance(content, Mapping):
+        raise CalibrationError(f"{where}: expected the keys of a camera")
+    camera_model = content.get("camera_model", "pinhole")
+    if camera_model != "pinhole":
+        raise CalibrationError(
+            f"{where}: camera model {shortened(camera_model)} is not supported, expected pinhole"
+        )
+    values = {name: _first(content, keys) for name, keys in _KEYS.items()}
+    model = None if values["model"] is None else str(values["model"])
+    if model is not None and "distortion_model" not in content:
+        supported_model(model, where)  # also of a lens without coefficients
+    if values["D"] is None:
+        order = _FISHEYE if known_model(model or "") == "equidistant" else _RADIAL_TANGENTIAL
+        values["D"] = [content[name] for name in order if name in content]
+    width, height = _size(content, values, where)
+    fields = CameraFields(
+        where=where,
+        width=width,
+        height=height,
+        model=model or _assumed_model(content, values["D"], where),
+        K=_K(content, values, where),
+        D=values["D"],
+        R=np.zeros(9) if values["R"] is None else values["R"],
+        P=np.zeros(12) if values["P"] is None else values["P"],
+        binning=(_count(content, "binning_x", where), _count(content, "binning_y", where)),
+        roi=_region(content.get("roi"), where),
+        is_distorted_by_zeros=values["K"] is None,
+    )
+    return DescribedCamera(
+        fields=fields,
+        T_body_cam=_transform(content, _TO_BODY, where),
+        T_cam_previous=_transform(content, _FROM_PREVIOUS, where),
+        focal_x_baseline=_focal_x_baseline(content, fields, where),
+    )
+
+
+def _size(content: Content, values: Content, where: str) -> tuple[int, int]:
+    """Return width and height, 0 where they are not said."""
+    if "resolution" in content:
+        width, height = map(int, _array(content, "resolution", (2,), where))
+        return width, height
+    width, height = (
+        0 if values[name] is None else _integer(values[name], f"{where}: {name}", least=1)
+        for name in ("width", "height")
+    )
+    return width, height
+
+
+def _K(content: Content, values: Content, where: str) -> Any:  # noqa: ANN401, N802 - YAML
+    """Return K, of a matrix, a list or numbers with keys of their own; zeros beside P alone."""
+    if values["K"] is not None:
+        return values["K"]
+    if "intrinsics" in content:
+        fx, fy, cx, cy = _array(content, "intrinsics", (4,), where)
+    elif all(name in content for name in _PINHOLE):
+        fx, fy, cx, cy = read_array([content[name] for name in _PINHOLE], (4,), f"{where}: fx, ...")
+    elif values["P"] is not None:
+        return np.zeros(9)
+    else:
+        missing = ", ".join(name for name in _PINHOLE if name not in content)
+        raise CalibrationError(f"{where}: lacks camera_matrix, intrinsics or {missing}; {_KNOWN}")
+    return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+
+
+def _focal_x_baseline(content: Content, fields: CameraFields, where: str) -> float | None:
+    for key in ("bf", "focal_x_baseline"):
+        if key in content:
+            return float(_array(content, key, (1,), where)[0])
+    if "b" not in content:
+        return None
+    fx = float(np.ravel(np.asarray(fields.K))[0])
+    return fx * float(_array(content, "b", (1,), where)[0])
+
+
+def _region(content: object, where: str) -> RegionOfInterest:
+    if not isinstance(content, Mapping):
+        return RegionOfInterest()
+    counts = {name: _count(content, name, f"{where}: roi") for name in RegionOfInterest.__slots__}
+    return RegionOfInterest(**counts)
+
+
+def _count(content: Content, key: str, where: str) -> int:
+    return _integer(content.get(key, 0), f"{where}: {key}", least=0)
+
+
+def _integer(value: object, what: str, *, least: int) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= _MAX_COUNT:
+        raise CalibrationError(
+            f"{what} must be an integer of {least} or more, got {shortened(value)}"
+        )
+    return value
+
+
+def _assumed_model(content: Content, D: object, where: str) -> str:
+    """Tell the model by what OpenCV writes: a flag for fisheyes, else the count decides."""
+    if content.get("fisheye_model"):
+        return "equidistant"
+    n_numbers = read_numbers(D, f"{where}: D").size
+    return "rational_polynomial" if n_numbers > 5 else "plumb_bob"
+
+
+def _first(content: Content, keys: tuple[str, ...]) -> Any:  # noqa: ANN401 - YAML
+    return _data(next((content[key] for key in keys if key in content), None))
+
+
+def _data(value: Any) -> Any:  # noqa: ANN401 - YAML
+    return value.get("data", value) if isinstance(value, Mapping) else value
+
+
+def _transform(content: Content, keys: Mapping[str, bool], where: str) -> FloatArray | None:
+    """Return the first of these that is there, inverted where it maps the other way round."""
+    key = next((key for key in keys if key in content), None)
+    if key is None:
+        return None
+    n_rows = 3 if np.size(_data(content[key])) == 12 else 4  # ORB-SLAM left the last one out
+    T = np.vstack([_array(content, key, (n_rows, 4), where), np.eye(4)[n_rows:]])
+    T[3] = np.round(T[3], 6)  # programs that invert transforms write their rounding
+    fault = se3.transform_fault(T, tolerance=ROTATION_TOLERANCE)
+    if fault:
+        raise CalibrationError(f"{where}: {key} {fault}")
+    return se3.invert(se3.normalize(T)) if keys[key] else se3.normalize(T)
+
+
+def _array(content: Content, key: str, shape: tuple[int, ...], where: str) -> FloatArray:
+    return read_array(_data(content[key]), shape, f"{where}: {key}")
+
+
+def _depth_scale(content: Content, path: Path) -> float | None:
+    parts = (content, _part(content, "RGBD"), _part(content, "Preprocessing"))
+    found = [(key, part[key]) for part in parts for key in _DEPTH_KEYS if key in part]
+    if not found:
+        return None
+    key, scale = found[0]
+    is_number = isinstance(scale, int | float) and not isinstance(scale, bool)
+    if not (is_number and 0 < scale < np.inf):
+        raise CalibrationError(f"{path}: {key} must be a positive number, got {shortened(scale)}")
+    # a factor of 1 is of depth in metres, of which there are no counts
+    return float(scale) if key == "depth_scale" or scale > 1 else None
+
+
+def _read(path: Path) -> str:
+    try:
+        with named_faults(CalibrationError, path, "the calibration cannot be read"):
+            return read_text(path, max_bytes=MAX_CHARACTERS)
+    except UnicodeDecodeError as error:
+        raise CalibrationError(f"{path}: the calibration is not text") from error
+
+
+def _load(text: str, path: Path) -> dict[Any, Any]:
+    """Load YAML, also as OpenCV reads it; the key a.b becomes b under a."""
+    if text.startswith("%YAML"):  # with OpenCV's colon it is no directive of YAML
+        text = _KEY_WITHOUT_BLANK.sub(r"\1: ", text.partition("\n")[2])
+    try:
+        # Of several documents, as `ros2 topic echo` prints them, the first counts.
+        content = load_yaml(text, _Loader)
+    except YamlError as error:
+        raise CalibrationError(f"{path}: the calibration is not YAML ({error})") from error
+    if not isinstance(content, dict):
+        raise CalibrationError(f"{path}: the calibration holds no keys")
+    nested: dict[Any, Any] = {}
+    for key, value in content.items():
+        group, _, name = key.partition(".") if isinstance(key, str) else (key, "", "")
+        if not name:
+            nested[key] = value
+        elif isinstance(part := nested.setdefault(group, {}), dict):
+            part[name] = value
+    return nested
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads the matrices of OpenCV as the keys that they consist of."""
+
+
+_Loader.add_constructor(_OPENCV_MATRIX, partial(_Loader.construct_mapping, deep=True))
+
+Form: TypeAlias = tuple[str, Callable[[Content, Path], Iterable[DescribedCamera]]]
+"""A pattern of one of its keys, and what reads the cameras."""
+FORMS: tuple[Form, ...] = (
+    ("cam0_calib", _of_vins),
+    ("relative_config_imucam", _of_estimator),
+    (_CHAIN.pattern, _of_chain),
+    ("left|LEFT", _of_pair),
+    ("StereoRectifier", _of_rectifier),
+    ("Camera1?", _of_slam),
+    ("intrinsics|camera_matrix|[Kk]|projection_.*", _of_one),
+)
+"""The first that fits; the first two name other files."""
