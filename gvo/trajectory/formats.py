@@ -80,7 +80,7 @@ def read_trajectory(path: str | Path, *, is_growing: bool = False) -> Trajectory
         line.
     """
     path = Path(path)
-    rows = read_rows(path, is_growing=is_growing)
+    rows = filter(_has_pose, read_rows(path, is_growing=is_growing))
     sample = list(islice(rows, _SAMPLE))
     if not sample and is_growing:
         return Trajectory(stamps_ns=np.empty(0, dtype=np.int64), T_world_frame=np.empty((0, 4, 4)))
@@ -94,6 +94,11 @@ def read_trajectory(path: str | Path, *, is_growing: bool = False) -> Trajectory
     form = _recognise(sample, header)
     n_columns = len(sample[0].fields)
     return _with_covariances(_read(path, chain(sample, rows), form, n_columns=n_columns), path)
+
+
+def _has_pose(row: Row) -> bool:
+    """Tell whether a row is none of those with which NCLT's ground truths begin: a stamp, NaN."""
+    return len(row.fields) != 7 or {field.lower() for field in row.fields[1:]} != {"nan"}
 
 
 def _recognise(rows: Sequence[Row], header: Sequence[str]) -> Form:

@@ -34,6 +34,7 @@ _FAULTS = {
 # rounding of published files: four decimals in TUM's ground truths, seven digits in KITTI's
 _ROUNDING = 1e-2
 _LATEST_S = 1e10  # the year 2286; later stamps are in another unit
+_HOUR_S = 3600.0
 _MIN_STEP_S, _MAX_STEP_S = 1e-3, 10.0
 _MAX_INDEX = 1e7
 _LARGEST = 1e20  # of a number: any stamp in int64
@@ -115,7 +116,6 @@ FORMS = (
     Form("ORB-SLAM3", (8,), "ns.", _X_FIRST, ("",)),
     Form("EuRoC", (8, 17), "ns", _W_FIRST),
     Form("VINS", (8, 11), "ns", _W_FIRST, (",,",)),
-    Form("OKVIS", (17,), "ns", _X_FIRST, (", ",)),
     Form("OpenVINS", range(17, 10_000), "s.", "stamp qx qy qz qw x y z", ("",)),
     Form("OpenVINS", (20,), "s.", _X_FIRST, ("",)),
     Form("KITTI", (12,), "none", _ROWS),
@@ -199,9 +199,10 @@ def _fits(stamps: Stamps, sample: Sample, column: int) -> bool:
     if (stamps == "ns" and has_fraction) or (stamps.endswith(".") and not has_fraction):
         return False
     if stamps in ("s", "s."):
-        # nine decimals are nanoseconds written in seconds, however slow the recording
-        is_exact = len(texts[0].partition(".")[2]) >= 9
-        return latest < _LATEST_S and (is_exact or not step > _MAX_STEP_S)
+        # Of slow recordings: nine decimals are nanoseconds written in seconds, six microseconds.
+        n_decimals = len(texts[0].partition(".")[2])
+        longest = np.inf if n_decimals >= 9 else _HOUR_S if n_decimals >= 6 else _MAX_STEP_S
+        return latest < _LATEST_S and not step > longest
     if np.isnan(step):
         return latest > _LATEST_S
     return _MIN_STEP_S <= 1e-9 * UNITS_NS[stamps] * step <= _MAX_STEP_S

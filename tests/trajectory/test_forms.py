@@ -74,6 +74,7 @@ EUROC = (
     "b_w_RS_S_y [rad s^-1], b_w_RS_S_z [rad s^-1], b_a_RS_S_x [m s^-2], b_a_RS_S_y [m s^-2], "
     "b_a_RS_S_z [m s^-2]\n"
 )
+UNKNOWN = "".join(f"{STAMPS_NS[0] // 1000 - 10_000 * k}{', NaN' * 6}\n" for k in range(150, 0, -1))
 SYSTEMS: dict[str, list[tuple[str, Row]]] = {
     "TUM": [
         (TUM_HEADER, lambda k: f"{seconds(k)[:-4]} {position(k)} {xyzw(k)}"),
@@ -86,6 +87,7 @@ SYSTEMS: dict[str, list[tuple[str, Row]]] = {
     "EuRoC": [
         (EUROC, lambda k: f"{STAMPS_NS[k]},{position(k, ',')},{wxyz(k, ',')},{state(9, ',')}"),
         ("", lambda k: f"{STAMPS_NS[k]},{position(k, ',')},{wxyz(k, ',')},{state(9, ',')}"),
+        ("", lambda k: f"{STAMPS_NS[k]}, {position(k, ', ')}, {wxyz(k, ', ')}, {state(9, ', ')}"),
     ],
     "VINS": [
         ("", lambda k: f"{STAMPS_NS[k]},{position(k, ',')},{wxyz(k, ',')},{state(3, ',')},"),
@@ -115,7 +117,10 @@ SYSTEMS: dict[str, list[tuple[str, Row]]] = {
         ),
     ],
     "KAIST": [("", lambda k: f"{STAMPS_NS[k]},{rows_of_matrix(k, ',')}")],
-    "NCLT": [("", lambda k: f"{STAMPS_NS[k] // 1000},{position(k, ',')},{angles(k)}")],
+    "NCLT": [
+        ("", lambda k: f"{STAMPS_NS[k] // 1000},{position(k, ',')},{angles(k)}"),
+        (UNKNOWN, lambda k: f"{STAMPS_NS[k] // 1000}, {position(k, ', ')}, {angles(k)}"),
+    ],
     "KITTI": [("", rows_of_matrix)],
     "KITTI-360": [
         ("", lambda k: f"{2 * k + 1} {rows_of_matrix(k)}"),
@@ -204,11 +209,6 @@ def test_a_header_decides(tmp_path: Path, header: str, row: Row) -> None:
 @pytest.mark.parametrize(
     ("header", "row", "match"),
     [
-        (
-            "",
-            lambda k: f"{STAMPS_NS[k]}, {position(k, ', ')}, {xyzw(k, ', ')}, {state(9, ', ')}",
-            r":1: 17 columns between commas.*fits EuRoC \(.*qw qx.* and OKVIS \(.*qz qw;",
-        ),
         ("", lambda k: f"{seconds(k)} {position(k)}", r":1: 4 columns between blanks.*no form"),
         ("", lambda k: f"{rows_of_matrix(k)} 0 0 0 1", ":1: 16 columns.*no form.*keep three rows"),
         (
@@ -263,10 +263,27 @@ def test_what_fits_no_form_or_two_is_refused(
     assert "\n" not in str(caught.value)
 
 
-def test_nine_decimals_are_seconds_however_slow_the_recording(tmp_path: Path) -> None:
+@pytest.mark.parametrize("first_s", [0, 1_403_636_579])
+@pytest.mark.parametrize(
+    ("step_s", "decimals"), [(12, "250000"), (3600, "250000"), (90_000, "000000000")]
+)
+def test_six_decimals_are_seconds_of_a_slow_recording_nine_of_any(
+    tmp_path: Path, first_s: int, step_s: int, decimals: str
+) -> None:
     path = tmp_path / "slow.txt"
-    path.write_text("".join(f"{60 * k}.000000000 {k} 0 0 0 0 0 1\n" for k in range(3)))
-    assert read_trajectory(path).stamps_ns.tolist() == [0, 60 * 10**9, 120 * 10**9]
+    rows = [f"{first_s + step_s * k}.{decimals} {k} 0 0 0 0 0 1\n" for k in range(3)]
+    path.write_text("".join(rows))
+    stamps_s = [first_s + step_s * k + float(f"0.{decimals}") for k in range(3)]
+    np.testing.assert_array_equal(read_trajectory(path).stamps_ns, np.array(stamps_s) * 1e9)
+
+
+@pytest.mark.parametrize("stamp", ["{}", "{}.5", "{}.333", "14036{:05}", "1403636{:06}.000000"])
+def test_steps_of_other_units_are_not_taken_for_seconds(tmp_path: Path, stamp: str) -> None:
+    path = tmp_path / "poses.txt"
+    step = 33_333 if "06" in stamp else 33
+    path.write_text("".join(f"{stamp.format(k * step)} {k} 0 0 0 0 0 1\n" for k in range(3)))
+    with pytest.raises(TrajectoryError, match="no form of poses"):
+        read_trajectory(path)
 
 
 def test_rows_of_a_matrix_are_no_quaternion_where_x_is_zero(tmp_path: Path) -> None:
