@@ -198,7 +198,7 @@ def _own_camera(
 ) -> Source:
     from gvo.io.calibration.files import paths_of
     from gvo.io.frames import Rig
-    from gvo.live.sources import Device, StandardInput
+    from gvo.live.sources import Device, ProcessInput
 
     files = paths_of(options.calibration)
     if not 1 <= len(files) <= 2:
@@ -206,7 +206,7 @@ def _own_camera(
     rig = Rig(*files, sensor=sensor, is_rectified=is_rectified)
     if names:
         return Device(names, rig.info)
-    return StandardInput(sys.stdin.buffer, rig.info, config, depth_scale=rig.depth_scale)
+    return ProcessInput(sys.stdin.fileno(), rig.info, config, depth_scale=rig.depth_scale)
 
 
 def _status(odometry: LiveOdometry) -> Callable[[Progress], None]:

@@ -421,8 +421,16 @@ def _run() -> Any:  # noqa: ANN401 - an exit code, or None
         raise ConfigurationError(message) from error
 
 
+def _open_standard_streams() -> None:
+    """Open those that the caller closed: else a file of the run gets the number of one."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))  # noqa: SIM115
+
+
 def main() -> None:
     """Run the command; one line and exit code 2 for bad input."""
+    _open_standard_streams()
     try:
         with flags_named(), ended_by_signals(), named_faults(GvoError, "gvo"):
             raise SystemExit(_run() or 0)

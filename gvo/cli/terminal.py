@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 # Share by which the total of a progress bar may be off.
 _MAX_OFF = 0.02
 _MAX_CHATTER = 1 << 15  # bytes; half of what a pipe holds
-_EXIT_CODES_OF_SIGNALS: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 143}
+_EXIT_CODES_OF_SIGNALS: dict[int, int] = {
+    number: 128 + number for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+}
 EXIT_FAULTS = 1
 EXIT_UNUSABLE = 2
 
@@ -109,7 +111,16 @@ def say(text: object, *, nl: bool = True, err: bool = False) -> None:
     """Print a result or a note, unless --quiet was given."""
     if _LOGGER.isEnabledFor(logging.WARNING):
         lines = [str(text)] if nl else str(text).split("\n")
-        typer.echo("\n".join(map(visible, lines)), nl=nl, err=err)
+        echo("\n".join(map(visible, lines)), nl=nl, err=err)
+
+
+def echo(text: str, *, nl: bool = True, err: bool = False) -> None:
+    """Print; where nobody reads it any more, print into nothing from then on."""
+    try:
+        typer.echo(text, nl=nl, err=err)
+    except OSError:
+        stream = sys.stderr if err else sys.stdout
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def exit_code(is_complete: bool) -> int:
@@ -193,7 +204,12 @@ def status(title: str) -> Iterator[Callable[[str], None]]:
 
 def _handle(handlers: Mapping[int, Any]) -> dict[int, Any]:
     """Set the handlers of signals; return those before."""
-    return {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    ignored = {signal.SIGHUP} if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else set()
+    return {
+        number: signal.signal(number, handler)
+        for number, handler in handlers.items()
+        if number not in ignored  # by nohup
+    }
 
 
 @contextmanager
@@ -210,7 +226,7 @@ def ended_by_signals() -> Iterator[None]:
         yield
     finally:
         if received:
-            typer.echo("gvo: interrupted; the same command begins anew", err=True)
+            echo("gvo: interrupted; the same command begins anew", err=True)
         _handle(before)
 
 
@@ -247,7 +263,7 @@ class Work(AbstractContextManager["Work"]):
             return
         words = self._undrawn if self._is_written and self._undrawn else self.stands
         if words:
-            typer.echo(f"gvo: interrupted; {visible(words)}", err=True)
+            echo(f"gvo: interrupted; {visible(words)}", err=True)
         number = self._received[0] if self._received else signal.SIGINT
         raise SystemExit(_EXIT_CODES_OF_SIGNALS[number]) from None
 

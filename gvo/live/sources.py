@@ -12,7 +12,10 @@ image has `"format": "png"` (or jpeg, ...) and `"size"` (bytes) in place of `enc
 
 from __future__ import annotations
 
+import io
 import json
+import os
+import select
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -134,6 +137,64 @@ class StandardInput:
         if len(data) < size:
             raise RecordingError(f"{_WHERE}: ends after {len(data)} of {size} bytes of an image")
         return np.frombuffer(data, dtype=np.uint8)
+
+
+class ProcessInput(StandardInput):
+    """The standard input of this process, whose images another thread can end.
+
+    A thread that waits in a read of `sys.stdin` until the process ends would hold its lock, and
+    the interpreter aborts where it cannot close it.
+
+    Parameters
+    ----------
+    number : int
+        Of the file, as `fileno` has it.
+    info, config, depth_scale
+        As of `StandardInput`.
+    """
+
+    def __init__(
+        self,
+        number: int,
+        info: RecordingInfo,
+        config: Config | None = None,
+        *,
+        depth_scale: float | None = None,
+    ) -> None:
+        self._file = _EndableFile(number)
+        super().__init__(io.BufferedReader(self._file), info, config, depth_scale=depth_scale)
+
+    def images(self) -> Iterator[StampedImage]:
+        """Yield the images as they arrive, until `close`."""
+        try:
+            yield from super().images()
+        except RecordingError:
+            if not self._file.is_ended:  # else the last image is cut there
+                raise
+
+    def close(self) -> None:
+        """End the images. Any thread may call it."""
+        self._file.end()
+
+
+class _EndableFile(io.RawIOBase):
+    """A file whose end another thread may declare while it is waited for."""
+
+    def __init__(self, number: int) -> None:
+        self._number = number
+        self._end, self._ends = os.pipe()
+        self.is_ended = False
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:  # noqa: ANN401 - whatever is writable
+        ready, _, _ = select.select([self._number, self._end], [], [])
+        return 0 if self._end in ready else os.readv(self._number, [buffer])
+
+    def end(self) -> None:
+        self.is_ended = True
+        os.write(self._ends, b".")
 
 
 def _message(type_: str, **fields: object) -> Any:  # noqa: ANN401 - made at run time

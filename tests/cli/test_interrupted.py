@@ -20,7 +20,7 @@ UNDRAWN = (
     "all is computed and in {out}, not drawn; --force begins anew, gvo compare --report draws it"
 )
 POSES_STAND = "the poses so far are in {out}; --force begins anew"
-CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
+CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
 
 
 Interrupt = Callable[..., None]
@@ -37,7 +37,7 @@ def interrupt(monkeypatch: pytest.MonkeyPatch) -> Interrupt:
     [
         (signal.SIGINT, "check {bag}", ANEW),
         (signal.SIGTERM, "convert {bag} {out}.bag", f"{{out}}.bag is not written; {ANEW}"),
-        (signal.SIGINT, "explain {bag} --frame 9 --out {out}", ANEW),
+        (signal.SIGHUP, "explain {bag} --frame 9 --out {out}", ANEW),
         (signal.SIGTERM, "run {bag} --out {out}", POSES_STAND),
     ],
 )

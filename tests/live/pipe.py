@@ -62,7 +62,9 @@ class Program:
         self.process.stdin.flush()
 
     def interrupt(self, number: signal.Signals = signal.SIGINT) -> int:
+        """Send a signal; return the exit code. Its standard input stays open and silent."""
         self.process.send_signal(number)
+        self.process.wait(PATIENCE_S)
         return self.end()
 
     def end(self) -> int:

@@ -2,7 +2,11 @@
 
 import io
 import json
+import os
+import signal
+import subprocess
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +22,7 @@ from gvo.io.sync import Pair
 from gvo.live.odometry import LiveOdometry, WaitingPairs
 from gvo.live.sources import StandardInput
 from gvo.types import FaultyFrame, Progress
-from tests.conftest import TABLES, Command, assert_same_files, refused
+from tests.conftest import ENVIRONMENT, GVO, TABLES, Command, assert_same_files, refused
 from tests.live.conftest import N_FRAMES
 from tests.live.pipe import LiveCommand, sent, write_calibration
 
@@ -144,17 +148,40 @@ def live(*arguments: object, calibration: list[Path], out: Path) -> list[str]:
     return [*map(str, arguments), *given, "--rectified", "--no-report", f"--out={out}"]
 
 
-def test_a_pipe_is_tracked_until_a_signal(drive_bag: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_pipe_is_tracked_until_a_signal(
+    number: signal.Signals, drive_bag: Path, tmp_path: Path
+) -> None:
     source = gvo.open_recording(drive_bag)
     with LiveCommand(source.info, tmp_path) as run:
-        run.feed(sent(source))
-        while n_poses(run.out) < N_FRAMES:  # the pipe stays open
+        # half an image stays half, and the sender is silent
+        run.feed(sent(source) + b'{"stream": "left", "stamp_ns": 0, "format": "png", "size": 9}\n.')
+        while n_poses(run.out) < N_FRAMES:
             assert run.process.poll() is None
-        assert run.interrupt() == 0, run.errors
+        assert run.interrupt(number) == 0, run.errors
     assert f"{N_FRAMES} frames, all tracked" in "".join(run.lines)
     summary = json.loads((run.out / "summary.json").read_text())
     assert summary["state"] == "complete"
     assert (run.out / "global.txt").exists()
+
+
+@pytest.mark.parametrize("closed", ["", ">&- 2>&-"])
+def test_a_run_goes_on_where_nobody_reads_what_it_says(
+    closed: str, drive_bag: Path, calibration: list[Path], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    words = [*GVO, *live("live", "-", "--queue=1000", calibration=calibration, out=out)]
+    command = ["sh", "-c", f'exec "$@" {closed}', "sh", *words]
+    reader, writer = os.pipe()
+    process = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=writer, stderr=writer, env=ENVIRONMENT
+    )
+    for end in (reader, writer):
+        os.close(end)
+    process.communicate(sent(gvo.open_recording(drive_bag)))
+    assert process.returncode == 0
+    assert n_poses(out) == N_FRAMES
+    assert json.loads((out / "summary.json").read_text())["state"] == "complete"
 
 
 @pytest.mark.parametrize(
@@ -184,10 +211,17 @@ def test_what_is_no_image_ends_in_one_line(header: bytes, fault: str, drive_bag:
     assert len(str(raised.value)) < 400
 
 
+@pytest.fixture
+def empty_input(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    with Path(os.devnull).open() as nothing:
+        monkeypatch.setattr("sys.stdin", nothing)
+        yield
+
+
+@pytest.mark.usefixtures("empty_input")
 def test_a_stream_without_an_image_is_named(
-    calibration: list[Path], tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+    calibration: list[Path], tmp_path: Path, command: Command
 ) -> None:
-    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO()))
     said = refused(command("live", *live("-", calibration=calibration, out=tmp_path / "out")))
     assert said == "gvo: error: standard input: no usable frame: it holds no image\n"
     assert not (tmp_path / "out").exists()
@@ -245,6 +279,7 @@ def test_a_device_gives_the_images_of_both_cameras(
         (("-", "--queue=0"), "max_waiting >= 1"),
     ],
 )
+@pytest.mark.usefixtures("empty_input")
 def test_what_cannot_be_opened_is_refused(
     words: tuple[str, ...], fault: str, calibration: list[Path], tmp_path: Path, command: Command
 ) -> None:
