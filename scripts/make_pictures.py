@@ -48,7 +48,7 @@ MAX_GREY_SPREAD = 24  # of red, green and blue, of a pixel that counts as grey
 N_COLOURS = 120
 WINDOW_PX = (1440, 1010)
 FROM_CAM, TO_CAM = np.array([4.0, -4.5, -10.0]), np.array([-0.5, 0.5, 4.0])
-"""From where and at what the page looks, metres, in the frame of the camera."""
+"""From where and at what the page looks, metres, beside the camera and its heading."""
 N_CORNERS = 60, 250, 1000
 INLIER_BGR = (233, 180, 86)
 FLAGS = (
@@ -182,7 +182,7 @@ def view(task: Task) -> Picture | None:
         Player(lambda config: gvo.open_recording(task.bag, config=config), Config()) as player,
         serve(player, port=0, truth=truth, name=task.bag.name) as page,
     ):
-        for _ in range(task.frame + 1):
+        for _ in range(task.frame):  # the page itself asks for the first one
             player.step()
         player.wait()
         driver = open_page(page.url)
@@ -191,12 +191,10 @@ def view(task: Task) -> Picture | None:
             driver.execute_script(HIDE_COMPLAINT)
             for title in ("Parameters", "klt"):
                 unfold(driver, title)
-            view = player.newest.view()
-            if view is None:
+            if player.newest.view() is None:
                 raise RecordingError(f"{task.bag}: {player.fault}")
-            R, t = view.T_world_frame[:3, :3], view.T_world_frame[:3, 3]
             for client in page.server.get_clients().values():
-                client.camera.position, client.camera.look_at = R @ FROM_CAM + t, R @ TO_CAM + t
+                client.camera.position, client.camera.look_at = FROM_CAM, TO_CAM
             time.sleep(3.0)  # the page draws on its own time
             return decoded(driver.get_screenshot_as_png())
         finally:

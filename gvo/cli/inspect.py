@@ -82,7 +82,9 @@ def view(
         truth = _find_truth(player.source)
         server = stack.enter_context(serve(player, host=host, port=port, truth=truth))
         warn([server.note] if server.note else [])
-        say(f"{server.url} shows {recordings[0].name}; Ctrl-C ends")
+        server.play_when_opened()
+        say(server.url)
+        say(f"{recordings[0].name} plays when a browser opens this address; Ctrl-C ends")
         while not server.wait(_SIGNALS_S):
             work.check()
 

@@ -21,15 +21,15 @@ from gvo.viz.view.clouds import Cloud
 _PATHS = ("raw", "causal", "smoothed", "truth")
 _LINKS = ("step", "keyframe link", "depth", "refused")
 _NODES = {
-    **{name: f"/paths/{name}" for name in _PATHS},
-    "keyframes": "/keyframes",
-    "links": "/links",
-    "loops": "/loops",
-    "ellipsoids": "/ellipsoids",
-    "image": "/camera/image",
-    "points": "/camera/points",
-    "cloud": "/cloud",
-    "ground": "/ground",
+    **{name: f"/world/paths/{name}" for name in _PATHS},
+    "keyframes": "/world/keyframes",
+    "links": "/world/links",
+    "loops": "/world/loops",
+    "ellipsoids": "/world/ellipsoids",
+    "image": "/world/camera/image",
+    "points": "/world/camera/points",
+    "cloud": "/world/cloud",
+    "ground": "/world/ground",
 }
 LAYERS = tuple(_NODES)
 """What can be hidden, by name."""
@@ -44,13 +44,19 @@ class Drawing:
     """What is drawn in 3-D, in the world of the first camera.
 
     An empty node is removed: browsers complain of it.
+
+    Attributes
+    ----------
+    world : viser.FrameHandle
+        What all hangs on: where it is placed, the browsers see the world.
     """
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._scene = scene
         scene.set_up_direction("-y")
         scene.world_axes.visible = False
-        self._camera = scene.add_frame("/camera", show_axes=False)
+        self.world = scene.add_frame("/world", show_axes=False)
+        self._camera = scene.add_frame("/world/camera", show_axes=False)
         self._layers = {
             layer: scene.add_frame(node, show_axes=False) for layer, node in _NODES.items()
         }
@@ -66,7 +72,7 @@ class Drawing:
         x, y = aspect * half_height, half_height
         self._corners = np.array([[-x, -y, 1.0], [x, -y, 1.0], [x, y, 1.0], [-x, y, 1.0]])
         self._frustum = self._scene.add_camera_frustum(
-            "/camera/image/frustum",
+            "/world/camera/image/frustum",
             2.0 * float(np.arctan(half_height)),
             aspect,
             # viser states the size of a frustum by its volume.
@@ -83,7 +89,7 @@ class Drawing:
     def show_ground(self, center: FloatArray, cell_m: float) -> None:
         """Draw a grid through a position (3,) of the world, thick lines ten cells apart."""
         self._scene.add_grid(
-            "/ground/grid",
+            "/world/ground/grid",
             width=_N_GRID_CELLS * cell_m,
             height=_N_GRID_CELLS * cell_m,
             plane="xz",
@@ -113,22 +119,22 @@ class Drawing:
 
     def show_points(self, cloud_cam: Cloud) -> None:
         """Draw the points of the current frame, in the camera frame."""
-        self._show_cloud("/camera/points/cloud", cloud_cam, _POINT_SHARE)
+        self._show_cloud("/world/camera/points/cloud", cloud_cam, _POINT_SHARE)
 
     def show_cloud(self, cloud_world: Cloud) -> None:
         """Draw the points of all keyframes, in the world."""
-        self._show_cloud("/cloud/points", cloud_world, _CLOUD_SHARE)
+        self._show_cloud("/world/cloud/points", cloud_world, _CLOUD_SHARE)
 
     def show_loops(self, lines: FloatArray) -> None:
         """Draw the loops so far, lines of shape (n, 2, 3), metres."""
-        self._show_lines("/loops/loops", lines, DRAWN["loops"])
+        self._show_lines("/world/loops/loops", lines, DRAWN["loops"])
 
     def show_scene(self, scene: Scene, n_sigmas: float) -> None:
         """Draw keyframes as small cameras, links, and ellipsoids of the window's poses."""
         edges = self._camera_edges([each.T_world_frame for each in scene.keyframes])
-        self._show_lines("/keyframes/cameras", edges, DRAWN["keyframes"])
+        self._show_lines("/world/keyframes/cameras", edges, DRAWN["keyframes"])
         for name in _LINKS:
-            node = f"/links/{name.replace(' ', '_')}"
+            node = f"/world/links/{name.replace(' ', '_')}"
             self._show_lines(node, scene.lines.get(name, _NO_LINES), DRAWN[name])
         self._show_ellipsoids(scene, n_sigmas)
 
@@ -142,7 +148,7 @@ class Drawing:
         return np.concatenate([_NO_LINES, *placed])
 
     def _show_ellipsoids(self, scene: Scene, n_sigmas: float) -> None:
-        node = "/ellipsoids/meshes"
+        node = "/world/ellipsoids/meshes"
         found = ellipsoids(scene.window, n_sigmas)
         self._scene.remove_by_name(node)
         if len(found.centres) == 0:

@@ -95,6 +95,15 @@ class Page(AbstractContextManager["Page"]):
         shown = "localhost" if host in ("0.0.0.0", "::") else host  # noqa: S104 - only shown
         return f"http://{shown}:{self.server.get_port()}"
 
+    def play_when_opened(self) -> None:
+        """Have the recording play as soon as the first browser opens the page."""
+
+        def play(_: viser.ClientHandle) -> None:
+            if not self._player.is_playing and self._player.newest.n_done <= 1:
+                self._player.play()
+
+        self.server.on_client_connect(play)
+
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait until the page is closed; return whether it is."""
         return self._is_closed.wait(timeout_s)
@@ -138,7 +147,7 @@ class Page(AbstractContextManager["Page"]):
     def _add_main_panel(self) -> None:
         gui = self.server.gui
         self._add_playback(gui)
-        self._view = ViewPoint(self.server)
+        self._view = ViewPoint(self.server, self.drawing.world)
         save = gui.add_button("save as YAML", hint="For gvo run --config; the browser saves it")
         save.on_click(self._on_save)
         self._sigmas = gui.add_slider(
@@ -252,7 +261,7 @@ class Page(AbstractContextManager["Page"]):
         self.drawing.set_camera(camera, _CAMERA_SHARE * depth)
         ground = frame.T_world_frame[:3, 3] - _GROUND_SHARE * depth * UP
         self.drawing.show_ground(ground, cell_m=10.0 ** math.floor(math.log10(0.1 * depth)))
-        self._view.look_along(frame.T_world_frame, _VIEW_SHARE * depth)
+        self._view.look_along(_VIEW_SHARE * depth)
 
     def _draw_paths(self, frame: FrameView) -> None:
         for name, (_, poses) in frame.paths.items():

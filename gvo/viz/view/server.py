@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import html
 import io
 import ipaddress
 import socket
@@ -19,6 +20,7 @@ from gvo.errors import ConfigurationError
 N_PORTS = 20
 """How many ports are tried, from the one asked for."""
 
+_VISER_TITLE = b"<title>Viser</title>"
 _MAX_PATH = 250  # bytes; the names of the page's files are shorter, no file's name is longer
 
 
@@ -33,7 +35,7 @@ class LocalServer(viser.ViserServer):
 def open_server(host: str, port: int, *, title: str) -> viser.ViserServer:
     """Bind and listen, or raise `ConfigurationError`."""
     free = find_port(host, port)
-    with silence(), _refusing_strangers(is_local=_is_loopback(host)):
+    with silence(), _answering(is_local=_is_loopback(host), title=title):
         server = LocalServer(host=host, port=free, label=title, verbose=False)
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     return server
@@ -57,9 +59,10 @@ def _is_loopback(host: str) -> bool:
 
 
 @contextlib.contextmanager
-def _refusing_strangers(*, is_local: bool) -> Iterator[None]:
-    """Make a server that starts inside the context refuse other pages; viser accepts all."""
+def _answering(*, is_local: bool, title: str) -> Iterator[None]:
+    """Make a server that starts inside refuse other pages, and name its own; viser does not."""
     serve = websockets_server.serve
+    named = f"<title>{html.escape(title)}</title>".encode()
 
     def guarded(*args: Any, process_request: Any, **options: Any) -> Any:  # noqa: ANN401
         def check(connection: Any, request: Any) -> Any:  # noqa: ANN401 - as websockets has it
@@ -68,7 +71,13 @@ def _refusing_strangers(*, is_local: bool) -> Iterator[None]:
                 return connection.respond(403, "gvo: not from another page\n")
             if len(request.path.partition("?")[0]) > _MAX_PATH:
                 return connection.respond(414, "gvo: no file of the page has so long a name\n")
-            return process_request(connection, request)
+            request.headers.pop("Accept-Encoding", None)
+            response = process_request(connection, request)
+            if response is not None and _VISER_TITLE in response.body:
+                response.body = response.body.replace(_VISER_TITLE, named, 1)
+                del response.headers["Content-Length"]
+                response.headers["Content-Length"] = str(len(response.body))
+            return response
 
         return serve(*args, process_request=check, **options)
 

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -60,27 +61,46 @@ def test_paths_links_and_loops_are_drawn(page: Page, player: FakePlayer) -> None
         player.show(index)
     show(page, player, 4, loops=(loop_of(4 * PERIOD_NS, 0),))
     for name in ("raw", "causal"):
-        (line,) = nodes(page, f"/paths/{name}/")
+        (line,) = nodes(page, f"/world/paths/{name}/")
         np.testing.assert_allclose(line.points[:, 1, 2], [1.0, 2.0, 3.0, 4.0])
-    (smoothed,) = nodes(page, "/paths/smoothed/")
+    (smoothed,) = nodes(page, "/world/paths/smoothed/")
     np.testing.assert_allclose(smoothed.points[:, 1, 0], 0.5)  # as the window has it
     for name, ends in (
-        ("/links/step", [[0.5, 0.0, 3.0], [0.0, 0.0, 4.0]]),
-        ("/links/refused", [[0.0, 0.0, 0.0], [0.0, 0.0, 4.0]]),
-        ("/loops/loops", [[0.5, 0.0, 4.0], [0.5, 0.0, 0.0]]),
+        ("/world/links/step", [[0.5, 0.0, 3.0], [0.0, 0.0, 4.0]]),
+        ("/world/links/refused", [[0.0, 0.0, 0.0], [0.0, 0.0, 4.0]]),
+        ("/world/loops/loops", [[0.5, 0.0, 4.0], [0.5, 0.0, 0.0]]),
     ):
         (node,) = nodes(page, name)
         np.testing.assert_allclose(node.points, [ends])
-    (camera,) = [node for node in nodes(page, "/camera") if node.name == "/camera"]
+    (camera,) = [node for node in nodes(page, "/world/camera") if node.name == "/world/camera"]
     np.testing.assert_allclose(camera.position, [0.0, 0.0, 4.0])
-    assert len(nodes(page, "/ellipsoids/meshes")) == len(nodes(page, "/keyframes/cameras")) == 1
+    assert (
+        len(nodes(page, "/world/ellipsoids/meshes"))
+        == len(nodes(page, "/world/keyframes/cameras"))
+        == 1
+    )
+
+
+def test_the_recording_plays_when_the_first_browser_opens_the_page(
+    page: Page, player: FakePlayer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[Any] = []
+    monkeypatch.setattr(page.server, "on_client_connect", opened.append)
+    page.play_when_opened()
+    (tell,) = opened
+    for is_playing, index in ((False, 0), (True, 0), (False, 5)):
+        player.calls.clear()
+        player.is_playing = is_playing
+        player.show(index)
+        tell(None)
+        assert ("play" in str(player.calls)) == (not is_playing and index == 0)
 
 
 def test_a_layer_that_is_hidden_stays_so(page: Page, player: FakePlayer) -> None:
     page.drawing.set_visible("raw", False)
     player.show(3)
     show(page, player, 4)
-    layer, line = nodes(page, "/paths/raw")
+    layer, line = nodes(page, "/world/paths/raw")
     assert (layer.visible, line.visible) == (False, True)  # what hangs on it is hidden with it
     page.drawing.set_visible("raw", True)
     assert layer.visible
@@ -120,7 +140,7 @@ def test_the_truth_is_drawn_from_the_first_pose(player: FakePlayer) -> None:
     with serve(as_player(player), port=0, truth=truth) as page:
         player.show(0)
         show(page, player, 20)
-        (line,) = nodes(page, "/paths/truth/")
+        (line,) = nodes(page, "/world/paths/truth/")
         ends = line.points.reshape(-1, 3)
     np.testing.assert_allclose(ends[:, :2], 0.0, atol=1e-5)
     assert 18.9 < ends[:, 2].max() <= 20.0001

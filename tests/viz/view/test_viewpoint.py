@@ -1,89 +1,67 @@
-"""The view moves with the camera, whatever browsers say of it and however late."""
+"""The camera stays where browsers look, its heading ahead."""
 
-import time
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from gvo.geometry import se3
 from gvo.types import FloatArray
 from gvo.viz.view.viewpoint import ViewPoint
-from tests.viz.view.fakes import pose_of
 
 
 class FakeServer:
-    """Browsers whose views are as they said last."""
+    """One browser, whose view is as it was set."""
 
     def __init__(self) -> None:
         self.box = SimpleNamespace(value=True)
         self.gui = SimpleNamespace(add_checkbox=lambda *args, **options: self.box)
         self.initial_camera = SimpleNamespace()
-        self.clients: dict[int, Any] = {}
-        self.on_connect: Any = None
-
-    def on_client_connect(self, callback: Any) -> None:
-        self.on_connect = callback
+        self.client = SimpleNamespace(camera=SimpleNamespace())
 
     def get_clients(self) -> dict[int, Any]:
-        return self.clients
-
-    def connect(self, number: int) -> Any:
-        # as it stands before it has heard of any view
-        camera = SimpleNamespace(position=np.full(3, 3.0), look_at=np.zeros(3))
-        self.clients[number] = client = SimpleNamespace(client_id=number, camera=camera)
-        self.on_connect(client)
-        return client
+        return {0: self.client}
 
 
-@pytest.fixture
-def server() -> FakeServer:
-    return FakeServer()
+def view_of(server: FakeServer) -> tuple[ViewPoint, Any]:
+    world = SimpleNamespace(wxyz=np.array([1.0, 0.0, 0.0, 0.0]), position=np.zeros(3))
+    return ViewPoint(cast(Any, server), cast(Any, world)), world
 
 
-@pytest.fixture
-def view(server: FakeServer) -> ViewPoint:
-    point = ViewPoint(cast(Any, server))
-    point.look_along(pose_of(0), 5.0)
-    return point
+def shown(world: Any, T_world_frame: FloatArray) -> FloatArray:
+    """Return where a browser sees a frame, shape (4, 4)."""
+    R = Rotation.from_quat(world.wxyz, scalar_first=True).as_matrix()
+    return np.asarray(se3.make_transform(R, world.position) @ T_world_frame)
 
 
-def seen(client: Any, index: int) -> tuple[FloatArray, FloatArray]:
-    """Return from where the camera at a frame is seen, and what is looked at."""
-    place = pose_of(index)[:3, 3]
-    return client.camera.position - place, client.camera.look_at - place
+@pytest.mark.parametrize("turn", [0.0, 0.5, -2.0, np.pi])
+def test_the_camera_stays_in_the_middle_and_its_heading_ahead(turn: float) -> None:
+    point, world = view_of(FakeServer())
+    yaw = se3.exp(np.array([0.0, turn, 0.0, 3.0, -1.0, 4.0]))
+    pitch = se3.exp(np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    point.show_pose(yaw @ pitch)
+    np.testing.assert_allclose(shown(world, yaw @ pitch), pitch, atol=1e-12)
+    down = yaw @ se3.exp(np.array([-np.pi / 2, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    point.show_pose(down)  # it has no heading: that of before counts
+    np.testing.assert_allclose(shown(world, down)[:3, 2], [0.0, 1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(shown(world, yaw), np.eye(4), atol=1e-12)
 
 
-def test_a_browser_that_tells_late_is_not_left_behind(server: FakeServer, view: ViewPoint) -> None:
-    client = server.connect(0)
-    start = seen(client, 0)
-    for index in range(1, 30):
-        was = client.camera.position, client.camera.look_at
-        view.show_pose(pose_of(index))
-        if index % 3 == 0:  # what it sent before it was moved arrives after that
-            client.camera.position, client.camera.look_at = was
-    view.show_pose(pose_of(30))
-    np.testing.assert_allclose(seen(client, 30), start, atol=1e-9)
-    np.testing.assert_allclose(seen(server.connect(1), 30), start, atol=1e-9)
-    server.box.value = False  # it does not follow any more
-    view.show_pose(pose_of(31))
-    np.testing.assert_allclose(seen(client, 30), start, atol=1e-9)
+def test_a_world_that_does_not_follow_stays() -> None:
+    server = FakeServer()
+    point, world = view_of(server)
+    point.show_pose(np.eye(4))
+    server.box.value = False
+    point.show_pose(se3.exp(np.ones(6)))
+    np.testing.assert_allclose(shown(world, np.eye(4)), np.eye(4))
 
 
-def test_a_view_that_was_turned_or_shifted_at_rest_stays_so(
-    server: FakeServer, view: ViewPoint, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    client = server.connect(0)
-    view.show_pose(pose_of(1))
-    client.camera.position = client.camera.look_at + np.array([7.0, -1.0, 0.0])
-    view.show_pose(pose_of(2))
-    np.testing.assert_allclose(client.camera.position - client.camera.look_at, [7.0, -1.0, 0.0])
-    aside = np.array([2.0, 0.0, 0.0])
-    client.camera.position = client.camera.position + aside
-    client.camera.look_at = client.camera.look_at + aside
-    shifted = seen(client, 2)
-    later_s = time.monotonic() + 10.0
-    monkeypatch.setattr(time, "monotonic", lambda: later_s)
-    for index in (3, 4):
-        view.show_pose(pose_of(index))
-    np.testing.assert_allclose(seen(client, 4), shifted)
+def test_browsers_look_from_behind_and_above() -> None:
+    server = FakeServer()
+    view_of(server)[0].look_along(5.0)
+    for camera in (server.initial_camera, server.client.camera):
+        x, y, z = camera.look_at - camera.position
+        assert (x, y > 0.0, z > y) == (0.0, True, True)
+        assert camera.near < 1.0 < 100.0 < camera.far
