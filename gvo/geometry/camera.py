@@ -199,6 +199,8 @@ class Calibration:
         The images are rectified already: only P counts.
     model : {"plumb_bob", "rational_polynomial", "equidistant"}
         What D means.
+    doubt : str
+        Why the intrinsics seem to be those of images of another size; empty if they do not.
     """
 
     width: int
@@ -209,6 +211,7 @@ class Calibration:
     P: FloatArray
     is_rectified: bool
     model: DistortionModel = "plumb_bob"
+    doubt: str = ""
 
     @classmethod
     def from_camera(cls, camera: PinholeCamera, *, baseline: float = 0.0) -> Calibration:

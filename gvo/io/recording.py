@@ -106,6 +106,13 @@ class RecordingInfo:
         return ("left", "right") if self.sensor == "stereo" else ("colour", "depth")
 
     @property
+    def doubt(self) -> str:
+        """Why a camera seems to be calibrated for images of another size; empty for none."""
+        depth = None if self.depth_view is None else self.depth_view.calibration
+        views = zip(self.stream_names, (*self.calibrations, depth), strict=False)
+        return next((f"{name}: {v.doubt}" for name, v in views if v and v.doubt), "")
+
+    @property
     def camera(self) -> StereoCamera | PinholeCamera:
         """The camera of the rectified frames."""
         if self.sensor == "stereo":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -244,9 +244,11 @@ def _within(truth: Truth, folder: RunFolder, loop: RunLoop) -> Truth:
     return replace(truth, trajectory=trajectory)
 
 
-def _warnings_of_camera(source: Source) -> list[str]:
-    changes = describe_camera_changes(source)
-    return [f"CameraInfo changes on the way ({changes}): {CAMERA_CHANGED}"] if changes else []
+def _warnings_of_camera(source: Source) -> Iterator[str]:
+    if source.info.doubt:
+        yield source.info.doubt
+    if changes := describe_camera_changes(source):
+        yield f"CameraInfo changes on the way ({changes}): {CAMERA_CHANGED}"
 
 
 def _warnings_of_truth(compared: TruthComparison | Failure) -> list[str]:

@@ -236,6 +236,21 @@ def test_a_run_warns_of_a_calibration_that_changes(
     assert command("check", room_bag).out.count("7 of /camera/color/camera_info") == 1
 
 
+def test_check_and_run_tell_of_a_calibration_for_images_of_another_size(
+    command: Command, room_bag: Path, tmp_path: Path
+) -> None:
+    camera = gvo.open_recording(room_bag).info.camera
+    K = [*(2.0 * camera.K).ravel().tolist()[:8], 1.0]
+    keys = {"width": camera.width, "height": camera.height, "k": K}
+    (tmp_path / "c.yaml").write_text(yaml.safe_dump(keys))
+    options = ["--calibration", tmp_path / "c.yaml", "--duration", "0.1", "--no-report"]
+    told = f"K fits an image of {2 * camera.width}x{2 * camera.height}, the image is "
+    answer = command("run", room_bag, "--out", tmp_path / "out", *options)
+    assert (answer.code, answer.err.count(f"gvo: warning: colour: {told}")) == (0, 1)
+    answer = command("check", room_bag, *options[:2])
+    assert (answer.code, answer.out.count(told), answer.out.count("factor 0.5")) == (1, 1, 1)
+
+
 def write_poses(path: Path, n: int = 20) -> Path:
     path.write_text("".join(f"{i} {i * i} 0 {i} 0 0 0 1\n" for i in range(n)))
     return path

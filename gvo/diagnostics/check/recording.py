@@ -71,7 +71,7 @@ def check_recording(
     camera = _find_camera(info)
     findings = [
         *_describe(info, found),
-        *_describe_camera(camera),
+        *_describe_camera(camera, info.doubt),
         *check_timing(found, info, config),
         check_usable(found.samples),
         *check_images(found.samples, config),
@@ -125,7 +125,7 @@ def _find_camera(info: RecordingInfo) -> PinholeCamera | Failure:
         return Failure(reason=str(error))
 
 
-def _describe_camera(camera: PinholeCamera | Failure) -> Iterator[Finding]:
+def _describe_camera(camera: PinholeCamera | Failure, doubt: str) -> Iterator[Finding]:
     if isinstance(camera, Failure):
         yield Finding(
             name="calibration",
@@ -135,6 +135,10 @@ def _describe_camera(camera: PinholeCamera | Failure) -> Iterator[Finding]:
             fix="give the right one by --calibration FILE",
         )
         return
+    if doubt:
+        value, _, fix = doubt.partition("; ")
+        threshold = "principal point near the centre"
+        yield judged("K", value, is_ok=False, threshold=threshold, otherwise="fault", fix=fix)
     view_deg = np.degrees(2.0 * np.arctan(0.5 * camera.width / camera.fx))
     yield Finding(name="focal length", value=f"{camera.fx:.1f} px, view of {view_deg:.0f} deg")
     if isinstance(camera, StereoCamera):

@@ -193,8 +193,8 @@ def _check_order(matches: FloatArray) -> Finding:
     sure = disparities[np.abs(disparities) > _SIGN_PX]
     share = float(np.mean(sure < 0)) if len(sure) >= MIN_STEREO_MATCHES else math.nan
     text = f"{share:.1%} of the disparities are negative, median {np.median(disparities):+.1f} px"
-    fix = "exchange --left and --right" if share > 0.5 else ""
-    return measured("left/right: order", share, text=text, fix=fix)
+    fix = "exchange --left and --right; if P forbids it, change its sign by --calibration FILE"
+    return measured("left/right: order", share, text=text, fix=fix if share > 0.5 else "")
 
 
 def _check_step(samples: Sequence[Sample], matcher: FreeMatcher) -> Finding:

@@ -22,7 +22,6 @@ from gvo.io.bag.messages import transform_of
 from gvo.io.bag.reader import BagMessage, MessageReader
 from gvo.io.bag.topics import CameraTopics
 from gvo.io.calibration.camera_info import (
-    has_baseline,
     make_calibration,
     make_rgbd_calibration,
     pair_of_baseline,
@@ -123,16 +122,26 @@ def _stereo_pair(
         make_calibration(camera.fields, is_rectified=camera.image.is_rectified)
         for camera in cameras
     )
-    if has_baseline(left, right) or (left.width, left.height) != (right.width, right.height):
+    info, offset = cameras[1].info_name, float(right.P[0, 3] - left.P[0, 3])
+    if offset < 0 or (left.width, left.height) != (right.width, right.height):
         baseline = stereo_baseline((left, right), where)
-        return (left, right), f"baseline: {baseline:.4f} m from P of {cameras[1].info_name}"
+        return (left, right), f"baseline: {baseline:.4f} m from P of {info}"
     found = _find_extrinsics(reader, *cameras)
-    if isinstance(found, Failure):
+    if isinstance(found, Failure) and not offset:
         raise CalibrationError(
-            f"{where}: the baseline must be positive, got none from P of {cameras[1].info_name}, "
-            f"nor from tf: {found.reason}; give --calibration FILE of the pair"
+            f"{where}: the baseline must be positive, got none from P of {info}, nor from tf: "
+            f"{found.reason}; give --calibration FILE of the pair"
+        )
+    if isinstance(found, Failure) or (offset and found[0][0, 3] <= 0):
+        raise CalibrationError(
+            f"{where}: P of {info} puts the right camera left of the left one (fourth number "
+            f"{right.P[0, 3]:+g}, expected a negative one), and tf says nothing else; exchange "
+            "--left and --right, or, if `gvo check` then finds the images exchanged, give "
+            "--calibration FILE of the pair with the other sign"
         )
     T_left_right, origin = found
+    if offset:
+        origin += f", which the sign of P of {info} contradicts"
     make_pair = pair_of_baseline if left.is_rectified else pair_of_extrinsics
     pair = make_pair((left, right), T_left_right, f"{where}: {origin}")
     baseline = stereo_baseline(pair, f"{where}: {origin}")

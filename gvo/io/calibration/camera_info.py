@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from typing import cast
 
 import numpy as np
@@ -33,6 +34,12 @@ _MODELS: dict[str, DistortionModel] = {
 _MAX_ANGLE_RAD = 1e-3
 # How far the baseline of rectified cameras may lean, by the rounding of tf, as a tangent.
 _MAX_SLOPE = 0.01
+# Of an image that K fits: its sides over those of the image it is given for, which a principal
+# point up to a tenth off the centre changes. And the half width of the view that K then gives, as a
+# tangent: 2 x 39 and 2 x 35 degrees. A cut image has a narrow view, not a wide one.
+_LEAST_LARGER, _WIDEST_LARGER = 1.4, 0.8
+_MOST_SMALLER, _NARROWEST_SMALLER = 0.6, 0.7
+_MAX_FACTOR, _EVEN = 10.0, 1.15
 # Up to here two cameras are one: what is left moves no pixel by a tenth.
 _ALIKE = 1e-5
 
@@ -113,6 +120,7 @@ def make_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibration
     it; `do_rectify` does not matter there either. Of rectified images only P counts.
     """
     K, R, P = _matrices(fields)
+    doubt = _doubt(P if is_rectified else K, fields)
     model, D = _distortion(fields, is_rectified=is_rectified)
     width, height = fields.recorded_size()
     binning, roi = fields.binning_factors, fields.roi
@@ -121,7 +129,15 @@ def make_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibration
         shift = np.array([[1.0, 0.0, -roi.x_offset], [0.0, 1.0, -roi.y_offset], [0.0, 0.0, 1.0]])
         K, P = scale @ shift @ K, scale @ shift @ P
     calibration = Calibration(
-        width=width, height=height, K=K, D=D, R=R, P=P, is_rectified=is_rectified, model=model
+        width=width,
+        height=height,
+        K=K,
+        D=D,
+        R=R,
+        P=P,
+        is_rectified=is_rectified,
+        model=model,
+        doubt=doubt,
     )
     check_camera(calibration, fields.where)
     return calibration
@@ -140,6 +156,32 @@ def make_rgbd_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibr
             "identity for an RGB-D camera; give rectified images or a calibration without R"
         )
     return calibration
+
+
+def _doubt(K: FloatArray, fields: CameraFields) -> str:
+    """Say which images K fits, where its principal point is far from the centre of these.
+
+    What is cut out of an image has it elsewhere, too, but seldom by such a share of both sides.
+    """
+    size = np.array([max(fields.width, 1), max(fields.height, 1)])
+    shares = (2.0 * K[:2, 2] + 1.0) / size
+    low, high = float(np.min(shares)), float(np.max(shares))
+    half_view = size[0] / (2.0 * K[0, 0])
+    is_larger = low >= _LEAST_LARGER and half_view <= _WIDEST_LARGER
+    is_smaller = high <= _MOST_SMALLER and half_view >= _NARROWEST_SMALLER
+    if not (is_larger or is_smaller) or not 1.0 / _MAX_FACTOR <= low <= high <= _MAX_FACTOR:
+        return ""
+    share = float(np.sqrt(low * high))
+    ratio = float(Fraction(max(share, 1.0 / share)).limit_denominator(2))
+    factor = ratio if share < 1.0 else 1.0 / ratio
+    is_even = high <= _EVEN * low
+    width, height = np.rint(size / factor if is_even else size * shares).astype(int)
+    what = "image" if fields.binning_factors == (1, 1) else "image before binning"
+    return (
+        f"K fits an image of {width}x{height}, the {what} is {size[0]}x{size[1]}"
+        f"{f': factor {factor:.3g}' if is_even else ''}; give the K of these images by "
+        "--calibration FILE, unless they were cut out of larger ones"
+    )
 
 
 def rectified_calibration(P: FloatArray, *, width: int, height: int) -> Calibration:

@@ -108,6 +108,28 @@ def test_rectified_images_without_baseline_take_it_fromtf(tmp_path: Path) -> Non
         _found(tmp_path / "b.bag", messages)
 
 
+@pytest.mark.parametrize("name", ["image_rect", "image_raw"])
+def test_tf_decides_where_the_sign_of_p_is_wrong(tmp_path: Path, name: str) -> None:
+    messages = _pair(name, P=_P)
+    P_right = [50.0, 0, 23.5, 12.5, *_P[4:]]
+    messages[3] = camera_info("/s/right/camera_info", "right_optical", P=P_right)
+    T = _pose([0, 0, 0], [0.25, 0, 0])
+    mount = tf("/tf_static", "left_optical", "right_optical", T)
+    found = _found(tmp_path / "a.bag", [*messages, mount])
+    assert found.calibrations[1].P[0, 3] == pytest.approx(-50 * 0.25)
+    assert found.decisions[-1] == (
+        "baseline: 0.2500 m from tf left_optical -> right_optical, which the sign of P of "
+        "/s/right/camera_info contradicts"
+    )
+    exchanged = tf("/tf_static", "left_optical", "right_optical", _pose([0, 0, 0], [-0.25, 0, 0]))
+    for number, more in enumerate(([], [exchanged])):
+        text = (
+            r"\+12.5, expected a negative one.* exchange --left and --right, .*--calibration FILE"
+        )
+        with pytest.raises(CalibrationError, match=text):
+            _found(tmp_path / f"{number}.bag", [*messages, *more])
+
+
 @pytest.mark.parametrize("is_compressed", [False, True])
 def test_a_size_of_zero_is_that_of_the_image(tmp_path: Path, is_compressed: bool) -> None:
     messages = _pair(width=0, height=0)

@@ -143,3 +143,47 @@ def test_a_binned_region_sees_a_point_where_the_full_image_has_it(
         atol=1e-9,
     )
     assert (part.width, part.height) == (1000 // scale, 800 // scale)
+
+
+_QUARTER = RegionOfInterest(x_offset=320, y_offset=240, width=320, height=240)
+
+
+@pytest.mark.parametrize(
+    ("size", "focal", "centre", "changes", "doubt"),
+    [
+        ((320, 240), 525, (319.5, 239.5), {}, "of 640x480, the image is 320x240: factor 0.5;"),
+        ((320, 240), 525, (325.1, 249.7), {}, "of 640x480, the image is 320x240: factor 0.5;"),
+        ((640, 480), 262, (160.0, 120.0), {}, "of 320x240, the image is 640x480: factor 2;"),
+        ((640, 480), 262, (160, 120), {"binning": (2, 2)}, "before binning is 640x480: factor 2;"),
+        ((640, 360), 650, (480.2, 268.1), {}, "of 960x540, the image is 640x360: factor 0.667;"),
+        ((640, 480), 900, (639.5, 359.5), {}, "of 1280x720, the image is 640x480; give the K"),
+        # cameras as they are: KITTI, EuRoC, freiburg1, KAIST, rectified TUM-VI; with a region
+        ((1241, 376), 718, (607.19, 185.22), {}, ""),
+        ((752, 480), 457, (379.999, 255.238), {}, ""),
+        ((640, 480), 517, (318.643, 255.314), {}, ""),
+        ((1280, 560), 813, (613.864, 249.41), {}, ""),
+        ((512, 512), 62, (240.229, 255.732), {}, ""),
+        ((640, 480), 525, (319.5, 239.5), {"roi": _QUARTER}, ""),
+        ((640, 480), 525, (319.5, 239.5), {"roi": _QUARTER, "binning": (2, 2)}, ""),
+        # cut: a third on the left; a quarter on the right and below; 40 % on the left and above
+        ((427, 480), 525, (106.5, 239.5), {}, ""),
+        ((480, 360), 525, (319.5, 239.5), {}, ""),
+        ((384, 288), 525, (63.5, 47.5), {}, ""),
+        ((640, 120), 525, (319.5, 239.5), {}, ""),
+        ((640, 480), 525, (0.0, 0.0), {}, ""),
+    ],
+)
+def test_a_principal_point_far_from_the_centre_tells_of_another_size(
+    size: tuple[int, int],
+    focal: float,
+    centre: tuple[float, float],
+    changes: dict[str, Any],
+    doubt: str,
+) -> None:
+    K = np.array([[focal, 0.0, centre[0]], [0.0, focal, centre[1]], [0.0, 0.0, 1.0]])
+    P = np.hstack([K, np.zeros((3, 1))])
+    for is_rectified in (False, True):
+        fields = _fields(width=size[0], height=size[1], K=K, P=P, **changes)
+        found = make_calibration(fields, is_rectified=is_rectified).doubt
+        assert doubt in found
+        assert bool(doubt) == bool(found)
