@@ -6,6 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future
 from dataclasses import replace
 from functools import partial
 from itertools import chain, count
@@ -129,7 +130,7 @@ class LiveOdometry:
         )
         self._stretches = Stretches(self.arrivals.watch(source.images()))
         self._loop: RunLoop | None = None
-        self._save: Callable[[], None] | None = None
+        self._save: Callable[[], Future[int]] | None = None
         self._messages: LiveMessages | None = None
         self.viewer: LivePlayer | None = None
         for sink in sinks:
@@ -219,7 +220,7 @@ class LiveOdometry:
         )
         return LiveRun(folder, result)
 
-    def _start(self, loop: RunLoop, save: Callable[[], None]) -> list[LiveMessages]:
+    def _start(self, loop: RunLoop, save: Callable[[], Future[int]]) -> list[LiveMessages]:
         """Note the loop of a run that begins; return the output that sends its poses."""
         base_frame = self._base_frame
         frames = name_frames(
@@ -252,24 +253,24 @@ class LiveOdometry:
         return {"success": True, "message": "a new run begins with the next image"}
 
     def _answer_save(self, _: object) -> dict[str, object]:
-        answer: dict[str, object] = {"success": False, "message": "no frame was tracked yet"}
-        is_done = threading.Event()
+        begun: Future[Future[int]] = Future()
 
         def save() -> None:
             try:
-                if self._save is not None and self._loop is not None:
-                    self._save()
-                    n_frames = self._loop.statistics.n_frames
-                    answer.update(success=True, message=f"{n_frames} frames are written")
+                if self._save is None:
+                    raise RecordingError("no frame was tracked yet")
+                begun.set_result(self._save())
             except GvoError as error:
-                answer["message"] = str(error)
-            finally:
-                is_done.set()
+                begun.set_exception(error)
 
         self._waiting.do(save)
-        if not is_done.wait(_PATIENCE_S):
-            answer["message"] = "the run is ending"
-        return answer
+        try:
+            message = f"{begun.result(_PATIENCE_S).result()} frames are written"
+        except TimeoutError:
+            return {"success": False, "message": "the run is ending"}
+        except GvoError as error:
+            return {"success": False, "message": str(error)}
+        return {"success": True, "message": message}
 
     def _answer_set_pose(self, request: Any) -> dict[str, object]:  # noqa: ANN401 - made at run time
         stamped = request.pose

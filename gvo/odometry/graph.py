@@ -12,6 +12,7 @@ import logging
 from collections import deque
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from copy import copy
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any, NamedTuple, TypeAlias
@@ -116,6 +117,15 @@ class RunGraph:
             self._passing.append(stamp_ns)
         while len(self) > self._max_frames and len(self._passing) > _N_RECENT:
             self._merge(self._passing.popleft())
+
+    def snapshot(self) -> RunGraph:
+        """Return a copy to optimize in another thread, which stays as it is while this grows."""
+        graph = copy(self)
+        graph.path, graph.parts = self.path.copy(), self.parts.copy()
+        graph._edges = {ends: [*edges] for ends, edges in self._edges.items()}
+        graph._neighbours = {ns: {*others} for ns, others in self._neighbours.items()}
+        graph._passing, graph.loops, graph._running = self._passing.copy(), (*self.loops,), None
+        return graph
 
     def settle(self, estimates: Iterable[Estimate]) -> None:
         """Take over better poses of frames, such as those that the window has smoothed."""

@@ -240,9 +240,13 @@ class Odometry:
         SmoothingError
             When GTSAM fails, and before the first frame.
         """
+        return self.snapshot().optimize()
+
+    def snapshot(self) -> RunGraph:
+        """Return the graph as it is now, to be optimized in another thread."""
         graph = self._map.graph
         graph.settle(self._window.estimate(frame_id) for frame_id in self._window.poses())
-        return graph.optimize()
+        return graph.snapshot()
 
     def trajectories(self) -> dict[str, Trajectory]:
         """Return the poses of all frames so far as "raw", "causal", "smoothed" and "global".

@@ -49,6 +49,12 @@ class Parts:
     def __init__(self) -> None:
         self._before: dict[int, int] = {}
 
+    def copy(self) -> Parts:
+        """Return a copy."""
+        parts = Parts()
+        parts._before = self._before.copy()
+        return parts
+
     def __contains__(self, stamp_ns: object) -> bool:
         """Tell whether a frame was added."""
         return stamp_ns in self._before
@@ -100,6 +106,12 @@ class Path:
     def __len__(self) -> int:
         """Return the number of frames."""
         return len(self.stamps_ns)
+
+    def copy(self) -> Path:
+        """Return a copy."""
+        path = Path()
+        path.stamps_ns, path._rows = self.stamps_ns[:], self._rows.copy()
+        return path
 
     def index(self, stamp_ns: int) -> int:
         """Return the number of a frame."""

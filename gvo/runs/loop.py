@@ -156,10 +156,10 @@ class RunLoop:
         Returns
         -------
         Optimum or None
-            As of `optimum`; also None if GTSAM fails, and then `output_faults` says so.
+            As of `begin_optimum`; also None if GTSAM fails, and then `output_faults` says so.
         """
         try:
-            optimum = self.optimum()
+            optimum = self.begin_optimum()()
         except SmoothingError as error:
             self.output_faults.append(f"no global poses: {error}")
             return None
@@ -167,22 +167,21 @@ class RunLoop:
             self._give(lambda output: output.add_optimum(optimum))
         return optimum
 
-    def optimum(self) -> Optimum | None:
-        """Return the optimum of all measurements so far, with poses of the base frame.
+    def begin_optimum(self) -> Callable[[], Optimum | None]:
+        """Return a function that computes the optimum of the frames so far, in any thread.
 
         Returns
         -------
-        Optimum or None
-            None if `loops.enabled` is off or no frame has a pose.
-
-        Raises
-        ------
-        SmoothingError
-            If GTSAM fails.
+        callable
+            Returns an Optimum with poses of the base frame; None if `loops.enabled` is off or no
+            frame has a pose. Raises `SmoothingError` if GTSAM fails.
         """
         if not self.config.loops.enabled or self.statistics.n_with_pose == 0:
-            return None
-        optimum = self._odometry.optimize()
+            return lambda: None
+        graph = self._odometry.snapshot()
+        return lambda: self._placed_optimum(graph.optimize())
+
+    def _placed_optimum(self, optimum: Optimum) -> Optimum:
         place = self.base_frame.apply_to_edge
         return replace(
             optimum,

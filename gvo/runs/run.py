@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -32,7 +33,7 @@ from gvo.trajectory.alignment import MAX_DIFFERENCE_NS
 from gvo.trajectory.evaluation import Consistency, Evaluation, consistency, motions_of_chain
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Failure, Progress
+from gvo.types import Failure, Optimum, Progress
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -49,7 +50,7 @@ def run_recording(
     outputs: RunOutputs | None = None,
     force: bool = False,
     through: Through | None = None,
-    on_start: Callable[[RunLoop, Callable[[], None]], Iterable[Output]] | None = None,
+    on_start: Callable[[RunLoop, Callable[[], Future[int]]], Iterable[Output]] | None = None,
     on_progress: Callable[[Progress], None] | None = None,
     on_written: Callable[[], None] | None = None,
 ) -> RunResult:
@@ -79,8 +80,9 @@ def run_recording(
         Queues the frames of a running camera; see `gvo.frames`.
     on_start : callable, optional
         Called before the first frame with the loop and a function `save`; returns outputs that
-        get each frame first. `save`, called between frames, writes the summary and the global
-        poses so far, and raises `SmoothingError` if the global poses fail.
+        get each frame first. `save`, called between frames, writes the summary, and in a thread
+        the global poses so far. It returns a future: the number of frames, or `SmoothingError` if
+        the global poses fail.
     on_progress : callable, optional
         Called after each frame.
     on_written : callable, optional
@@ -117,8 +119,10 @@ def run_recording(
         folder = files.enter_context(RunFolder(Path(out)))
         stack.push(partial(_draw_if_interrupted, Path(out), outputs))
         with RunningSummary(loop, folder, identity, on_progress) as summary:
-            first = on_start(loop, partial(_save, loop, folder, summary)) if on_start else ()
-            loop.run([*first, folder, *others], summary)
+            with ThreadPoolExecutor(1) as pool:  # what is being saved is written to its end
+                save = partial(_begin_save, loop, folder, summary, pool)
+                first = on_start(loop, save) if on_start else ()
+                loop.run([*first, folder, *others], summary)
             optimum = loop.optimize()
             faults = [*dict.fromkeys([*loop.output_faults, *_close([folder, *others])])]
             files.pop_all()  # nothing is left to close
@@ -131,13 +135,20 @@ def run_recording(
     return drawn(result, Path(out), plots=outputs.plots) if outputs.report else result
 
 
-def _save(loop: RunLoop, folder: RunFolder, summary: RunningSummary) -> None:
-    """Write the summary and the global poses so far; the latter last, since they may fail."""
+def _begin_save(
+    loop: RunLoop, folder: RunFolder, summary: RunningSummary, pool: ThreadPoolExecutor
+) -> Future[int]:
+    """Write the summary, and in a thread the global poses so far; they may fail."""
     loop.count()
     summary.write("running")
-    optimum = loop.optimum()
+    return pool.submit(_save, folder, loop.begin_optimum(), loop.statistics.n_frames)
+
+
+def _save(folder: RunFolder, compute: Callable[[], Optimum | None], n_frames: int) -> int:
+    optimum = compute()
     if optimum is not None:
         folder.add_optimum(optimum)
+    return n_frames
 
 
 def _close(files: Iterable[RunFolder | FileOutput]) -> list[str]:

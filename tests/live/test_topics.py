@@ -25,9 +25,10 @@ from gvo.io.recording import ChosenImages, StampedImage
 from gvo.live.odometry import LiveOdometry, LiveRun, Stretches
 from gvo.live.topics import NetworkReader, TopicSource, wait_for
 from gvo.live.transport import Parameters, decode
+from gvo.odometry.graph import RunGraph
 from gvo.runs.outputs.bag import TOPICS
 from gvo.trajectory.formats import read_trajectory
-from gvo.types import FloatArray, Progress
+from gvo.types import FloatArray, Optimum, Progress
 from tests.conftest import TABLES, assert_same_files
 from tests.live.conftest import N_FRAMES
 from tests.live.network import Network, recorded
@@ -274,6 +275,40 @@ def test_a_run_is_saved_moved_and_changed_while_it_goes_on(drive_bag: Path, tmp_
     written = read_trajectory(folder / "causal.txt").T_world_frame
     step = se3.invert(written[last]) @ written[last + 1]
     np.testing.assert_allclose(causal[last + 1], T_set @ step, atol=1e-6)
+
+
+def test_tracking_goes_on_while_a_run_is_saved(
+    drive_bag: Path, drive_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, may_end = threading.Event(), threading.Event()
+    optimize = RunGraph.optimize
+
+    def hold(graph: RunGraph) -> Optimum:
+        begun.set()
+        assert may_end.wait(60)
+        return optimize(graph)
+
+    monkeypatch.setattr(RunGraph, "optimize", hold)
+    answers: list[Any] = []
+
+    def script(play: Play) -> None:
+        play.send(0, half(play))
+        play.network.wait_for(ODOMETRY, N_FRAMES // 2)
+        saving = threading.Thread(target=lambda: answers.append(play.call("/gvo/save")))
+        saving.start()
+        assert begun.wait(60)
+        play.send(half(play), len(play.messages))
+        play.network.wait_for(ODOMETRY, N_FRAMES)
+        may_end.set()
+        saving.join(60)
+        lines = (tmp_path / "out" / "global.txt").read_text().splitlines()
+        answers.append(len(lines))
+
+    ((folder, _),) = Play(drive_bag, script).run(tmp_path / "out")
+    answer, n_saved = answers
+    assert (answer.success, answer.message) == (True, f"{n_saved} frames are written")
+    assert n_saved == N_FRAMES // 2
+    assert_same_files(folder, drive_run, (*TABLES, "global.txt", "graph.g2o"))
 
 
 def set_pose(play: Play, T: FloatArray, frame: str) -> None:

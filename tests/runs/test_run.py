@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from gvo.errors import RecordingError, SmoothingError, TrajectoryError
 from gvo.geometry import se3
 from gvo.io.poses.inputs import read_truth
 from gvo.io.synthetic import SyntheticRecording
-from gvo.odometry.odometry import Odometry
+from gvo.odometry.graph import RunGraph
 from gvo.runs.loop import Output, RunLoop
 from gvo.runs.outputs.bag import RunBag
 from gvo.testing import FaultySource
@@ -174,21 +175,21 @@ def test_an_antenna_on_a_lever_arm_gives_the_errors_of_its_place(
 def test_global_poses_that_fail_in_the_middle_are_no_fault_at_the_end(
     room: SyntheticRecording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    saves: list[Callable[[], None]] = []
+    saves: list[Callable[[], Future[int]]] = []
 
-    def on_start(_: RunLoop, save: Callable[[], None]) -> list[Output]:
+    def on_start(_: RunLoop, save: Callable[[], Future[int]]) -> list[Output]:
         saves.append(save)
         return []
 
-    def fail(_: Odometry) -> Optimum:
+    def fail(_: RunGraph) -> Optimum:
         raise SmoothingError("GTSAM: not now")
 
     def save_badly(progress: Progress) -> None:
         if progress.n_done == 6:
             with monkeypatch.context() as patch:
-                patch.setattr(Odometry, "optimize", fail)
+                patch.setattr(RunGraph, "optimize", fail)
                 with pytest.raises(SmoothingError, match="not now"):
-                    saves[0]()
+                    saves[0]().result()
             assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 6
 
     result = run_of(room, tmp_path, on_start=on_start, on_progress=save_badly)
