@@ -122,25 +122,21 @@ def _stereo_pair(
         make_calibration(camera.fields, is_rectified=camera.image.is_rectified)
         for camera in cameras
     )
-    info, offset = cameras[1].info_name, float(right.P[0, 3] - left.P[0, 3])
-    if offset < 0 or (left.width, left.height) != (right.width, right.height):
+    info, offset = cameras[1].info_name, float(left.P[0, 3] - right.P[0, 3])
+    if offset > 0 or (left.width, left.height) != (right.width, right.height):
         baseline = stereo_baseline((left, right), where)
         return (left, right), f"baseline: {baseline:.4f} m from P of {info}"
     found = _find_extrinsics(reader, *cameras)
-    if isinstance(found, Failure) and not offset:
+    if isinstance(found, Failure) or (offset < 0 and found[0][0, 3] <= 0):
+        reason = found.reason if isinstance(found, Failure) else "it has the same sign"
+        swap = "exchange --left and --right or, if `gvo check` then finds the images exchanged, "
         raise CalibrationError(
-            f"{where}: the baseline must be positive, got none from P of {info}, nor from tf: "
-            f"{found.reason}; give --calibration FILE of the pair"
-        )
-    if isinstance(found, Failure) or (offset and found[0][0, 3] <= 0):
-        raise CalibrationError(
-            f"{where}: P of {info} puts the right camera left of the left one (fourth number "
-            f"{right.P[0, 3]:+g}, expected a negative one), and tf says nothing else; exchange "
-            "--left and --right, or, if `gvo check` then finds the images exchanged, give "
-            "--calibration FILE of the pair with the other sign"
+            f"{where}: the baseline must be positive, got {offset / left.P[0, 0]:.4g} m from P[3] "
+            f"of {info}, and none from tf: {reason}; {swap if offset < 0 else ''}give "
+            "--calibration FILE of the pair"
         )
     T_left_right, origin = found
-    if offset:
+    if offset < 0:
         origin += f", which the sign of P of {info} contradicts"
     make_pair = pair_of_baseline if left.is_rectified else pair_of_extrinsics
     pair = make_pair((left, right), T_left_right, f"{where}: {origin}")

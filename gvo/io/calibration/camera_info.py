@@ -129,18 +129,10 @@ def make_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibration
         shift = np.array([[1.0, 0.0, -roi.x_offset], [0.0, 1.0, -roi.y_offset], [0.0, 0.0, 1.0]])
         K, P = scale @ shift @ K, scale @ shift @ P
     calibration = Calibration(
-        width=width,
-        height=height,
-        K=K,
-        D=D,
-        R=R,
-        P=P,
-        is_rectified=is_rectified,
-        model=model,
-        doubt=doubt,
+        width=width, height=height, K=K, D=D, R=R, P=P, is_rectified=is_rectified, model=model
     )
     check_camera(calibration, fields.where)
-    return calibration
+    return replace(calibration, doubt=doubt)
 
 
 def make_rgbd_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibration:
@@ -181,19 +173,6 @@ def _doubt(K: FloatArray, fields: CameraFields) -> str:
         f"K fits an image of {width}x{height}, the {what} is {size[0]}x{size[1]}"
         f"{f': factor {factor:.3g}' if is_even else ''}; give the K of these images by "
         "--calibration FILE, unless they were cut out of larger ones"
-    )
-
-
-def rectified_calibration(P: FloatArray, *, width: int, height: int) -> Calibration:
-    """Return the calibration of rectified images that P, shape (3, 4), alone describes."""
-    return Calibration(
-        width=width,
-        height=height,
-        K=P[:, :3].copy(),
-        D=np.zeros(5),
-        R=np.eye(3),
-        P=P,
-        is_rectified=True,
     )
 
 
@@ -277,7 +256,7 @@ def supported_model(name: str, where: str) -> DistortionModel:
     model = known_model(name)
     if model is None:
         raise CalibrationError(
-            f"{where}: distortion model {shortened(name)} is not supported, expected plumb_bob "
+            f"{where}: model {shortened(name)} is not supported, expected plumb_bob "
             "(pinhole, radtan), rational_polynomial or equidistant (fisheye, Kannala-Brandt); "
             "rectify the images first"
         )

@@ -139,12 +139,12 @@ def _elsewhere(path: Path, name: object) -> tuple[DescribedCamera, ...]:
 
 def _of_chain(content: Content, path: Path) -> Iterable[DescribedCamera]:
     chain = {int(match[1]): key for key in content if (match := _CHAIN.fullmatch(str(key)))}
-    return [_described(content[chain[n]], f"{path}: {chain[n]}") for n in sorted(chain)]
+    return [_described(_part(content, chain[n]), f"{path}: {chain[n]}") for n in sorted(chain)]
 
 
 def _of_pair(content: Content, path: Path) -> Iterable[DescribedCamera]:
-    names = ("left", "right") if "left" in content else ("LEFT", "RIGHT")
-    return [_described(content.get(name), f"{path}: {name}") for name in names]
+    names = ("left", "right") if _part(content, "left") else ("LEFT", "RIGHT")
+    return [_described(_part(content, name), f"{path}: {name}") for name in names]
 
 
 def _of_slam(content: Content, path: Path) -> Iterable[DescribedCamera]:
@@ -179,28 +179,34 @@ def _of_one(content: Content, path: Path) -> Iterable[DescribedCamera]:
 
 
 def _part(content: Content, name: str) -> dict[Any, Any]:
-    """Return the keys under a name; empty if there are none."""
-    part = content.get(name)
-    return dict(part) if isinstance(part, Mapping) else {}
+    """Return the keys under a name, or those that begin with it and a dot, which is left out."""
+    part, start = content.get(name), f"{name}."
+    if isinstance(part, Mapping):
+        return dict(part)
+    return {k.removeprefix(start): v for k, v in content.items() if str(k).startswith(start)}
 
 
-def _described(content: object, where: str) -> DescribedCamera:
-    if not isinstance(content, Mapping):
-        raise CalibrationError(f"{where}: expected the keys of a camera")
-    camera_model = content.get("camera_model", "pinhole")
-    if camera_model != "pinhole":
-        raise CalibrationError(
-            f"{where}: camera model {shortened(camera_model)} is not supported, expected pinhole"
-        )
+def _described(content: Content, where: str) -> DescribedCamera:
+    fields = _fields(content, where)
+    return DescribedCamera(
+        fields=fields,
+        T_body_cam=_transform(content, _TO_BODY, where),
+        T_cam_previous=_transform(content, _FROM_PREVIOUS, where),
+        focal_x_baseline=_focal_x_baseline(content, fields, where),
+    )
+
+
+def _fields(content: Content, where: str) -> CameraFields:
     values = {name: _first(content, keys) for name, keys in _KEYS.items()}
-    model = None if values["model"] is None else str(values["model"])
-    if model is not None and "distortion_model" not in content:
-        supported_model(model, where)  # also of a lens without coefficients
+    model = str(values["model"] or "")
+    for key in ("camera_model", *_KEYS["model"][1:]):
+        supported_model(str(content.get(key, "pinhole")), where)  # with coefficients or without
     if values["D"] is None:
-        order = _FISHEYE if known_model(model or "") == "equidistant" else _RADIAL_TANGENTIAL
+        order = _FISHEYE if known_model(model) == "equidistant" else _RADIAL_TANGENTIAL
         values["D"] = [content[name] for name in order if name in content]
-    width, height = _size(content, values, where)
-    fields = CameraFields(
+    size = content.get("resolution", [values["width"] or 0, values["height"] or 0])
+    width, height = map(int, read_array(_data(size), (2,), f"{where}: width and height"))
+    return CameraFields(
         where=where,
         width=width,
         height=height,
@@ -213,24 +219,6 @@ def _described(content: object, where: str) -> DescribedCamera:
         roi=_region(content.get("roi"), where),
         is_distorted_by_zeros=values["K"] is None,
     )
-    return DescribedCamera(
-        fields=fields,
-        T_body_cam=_transform(content, _TO_BODY, where),
-        T_cam_previous=_transform(content, _FROM_PREVIOUS, where),
-        focal_x_baseline=_focal_x_baseline(content, fields, where),
-    )
-
-
-def _size(content: Content, values: Content, where: str) -> tuple[int, int]:
-    """Return width and height, 0 where they are not said."""
-    if "resolution" in content:
-        width, height = map(int, _array(content, "resolution", (2,), where))
-        return width, height
-    width, height = (
-        0 if values[name] is None else _integer(values[name], f"{where}: {name}", least=1)
-        for name in ("width", "height")
-    )
-    return width, height
 
 
 def _K(content: Content, values: Content, where: str) -> Any:  # noqa: ANN401, N802 - YAML
@@ -250,13 +238,11 @@ def _K(content: Content, values: Content, where: str) -> Any:  # noqa: ANN401, N
 
 
 def _focal_x_baseline(content: Content, fields: CameraFields, where: str) -> float | None:
-    for key in ("bf", "focal_x_baseline"):
+    for key in ("bf", "focal_x_baseline", "b"):
         if key in content:
-            return float(_array(content, key, (1,), where)[0])
-    if "b" not in content:
-        return None
-    fx = float(np.ravel(np.asarray(fields.K))[0])
-    return fx * float(_array(content, "b", (1,), where)[0])
+            fx = float(np.ravel(np.asarray(fields.K))[0]) if key == "b" else 1.0
+            return fx * float(_array(content, key, (1,), where)[0])
+    return None
 
 
 def _region(content: object, where: str) -> RegionOfInterest:
@@ -267,15 +253,10 @@ def _region(content: object, where: str) -> RegionOfInterest:
 
 
 def _count(content: Content, key: str, where: str) -> int:
-    return _integer(content.get(key, 0), f"{where}: {key}", least=0)
-
-
-def _integer(value: object, what: str, *, least: int) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= _MAX_COUNT:
-        raise CalibrationError(
-            f"{what} must be an integer of {least} or more, got {shortened(value)}"
-        )
-    return value
+    count = content.get(key, 0)
+    if not isinstance(count, int) or not 0 <= count <= _MAX_COUNT:
+        raise CalibrationError(f"{where}: {key} must be a count, got {shortened(count)}")
+    return count
 
 
 def _assumed_model(content: Content, D: object, where: str) -> str:
@@ -334,7 +315,7 @@ def _read(path: Path) -> str:
 
 
 def _load(text: str, path: Path) -> dict[Any, Any]:
-    """Load YAML, also as OpenCV reads it; the key a.b becomes b under a."""
+    """Load YAML, also as OpenCV reads it."""
     if text.startswith("%YAML"):  # with OpenCV's colon it is no directive of YAML
         text = _KEY_WITHOUT_BLANK.sub(r"\1: ", text.partition("\n")[2])
     try:
@@ -344,14 +325,7 @@ def _load(text: str, path: Path) -> dict[Any, Any]:
         raise CalibrationError(f"{path}: the calibration is not YAML ({error})") from error
     if not isinstance(content, dict):
         raise CalibrationError(f"{path}: the calibration holds no keys")
-    nested: dict[Any, Any] = {}
-    for key, value in content.items():
-        group, _, name = key.partition(".") if isinstance(key, str) else (key, "", "")
-        if not name:
-            nested[key] = value
-        elif isinstance(part := nested.setdefault(group, {}), dict):
-            part[name] = value
-    return nested
+    return content
 
 
 class _Loader(yaml.SafeLoader):
@@ -366,9 +340,9 @@ FORMS: tuple[Form, ...] = (
     ("cam0_calib", _of_vins),
     ("relative_config_imucam", _of_estimator),
     (_CHAIN.pattern, _of_chain),
-    ("left|LEFT", _of_pair),
-    ("StereoRectifier", _of_rectifier),
-    ("Camera1?", _of_slam),
+    (r"(left|LEFT)(\..*)?", _of_pair),
+    (r"StereoRectifier(\..*)?", _of_rectifier),
+    (r"Camera1?(\..*)?", _of_slam),
     ("intrinsics|camera_matrix|[Kk]|projection_.*", _of_one),
 )
 """The first that fits; the first two name other files."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -16,7 +17,6 @@ from gvo.errors import GvoError, RecordingError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
 from gvo.io.bag.source import BagSource
-from gvo.io.calibration.camera_info import rectified_calibration
 from gvo.io.edges.events import InputFaults
 from gvo.io.frames import ImagePreparer, make_preparers
 from gvo.io.recording import RecordingInfo, Source, StampedImage
@@ -148,10 +148,10 @@ def plan_images(
     if is_raw and not is_rectifying:
         return info.calibrations, preparers
     # without K and R of the raw camera: the same for all who read it
-    ideal = (
-        rectified_calibration(raw.P, width=raw.width, height=raw.height)
-        for raw in info.calibrations
-    )
+    no_lens: dict[str, Any] = {"D": np.zeros(5), "R": np.eye(3), "model": "plumb_bob"}
+    ideal = [
+        replace(raw, K=raw.P[:, :3], is_rectified=True, **no_lens) for raw in info.calibrations
+    ]
     return tuple(ideal), preparers
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from gvo.config import Config
@@ -51,7 +52,7 @@ class EurocSource(FolderSource):
         images = {name: _list_images(self._root / name) for name in ("cam0", "cam1")}
         sensors = [self._root / name / "sensor.yaml" for name in images]
         files = paths_of(calibration, *sensors)
-        size = image_size(images["cam0"], config)
+        size = partial(image_size, images["cam0"], config)
         cameras = read_cameras(files, sensor="stereo", is_rectified=False, image_size=size)
         rectification = "from T_BS and distortion of cam0 and cam1"
         if calibration:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gvo._text import cut, text_lines
 from gvo.config import Config
 from gvo.errors import RecordingError
-from gvo.io.calibration.files import CameraSet, ImageSize
+from gvo.io.calibration.files import CameraSet
 from gvo.io.images import GreyRange, read_image
 from gvo.io.recording import RecordingInfo, Sensor, StampedImage, shown
 from gvo.trajectory.trajectory import parse_stamp
@@ -89,16 +89,12 @@ def loader(config: Config | None) -> Load:
     return partial(read_image, grey_range=GreyRange(black=images.black, white=images.white))
 
 
-def image_size(rows: Sequence[StampedPath], config: Config | None) -> ImageSize:
-    """Return what reads width and height of the first image that can be read."""
-    return partial(_image_size, rows, loader(config))
-
-
-def _image_size(rows: Sequence[StampedPath], load: Load) -> tuple[int, int]:
+def image_size(rows: Sequence[StampedPath], config: Config | None) -> tuple[int, int]:
+    """Return width and height of the first image that can be read."""
     first_fault = ""
     for _, path in rows:
         try:
-            height, width = load(Path(path)).shape[:2]
+            height, width = loader(config)(Path(path)).shape[:2]
         except RecordingError as error:
             first_fault = first_fault or str(error)
             continue  # it becomes a faulty frame later

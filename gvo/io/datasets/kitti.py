@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -54,7 +55,7 @@ class KittiSource(FolderSource):
             files,
             sensor="stereo",
             is_rectified=True,
-            image_size=image_size(images[names[0]], config),
+            image_size=partial(image_size, images[names[0]], config),
             first=int(names[0][-1]),
         )
         P = cameras.calibrations[0].P

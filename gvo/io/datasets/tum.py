@@ -69,9 +69,8 @@ class TumSource(FolderSource):
     ) -> None:
         self._folder = folder
         images = {name: _list_images(folder / f"{name}.txt") for name in ("rgb", "depth")}
-        cameras = _find_calibration(
-            folder, paths_of(calibration), image_size(images["rgb"], config)
-        )
+        size = partial(image_size, images["rgb"], config)
+        cameras = _find_calibration(folder, paths_of(calibration), size)
         configured = (config or Config()).depth.scale
         if configured is not None:
             scale, reason = configured, "by depth.scale"

@@ -462,7 +462,7 @@ def test_a_stereo_pair_is_two_cameras(tmp_path: Path, tiny: Any) -> None:
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"camera_model": "omni"}, "camera model 'omni' is not supported, expected pinhole"),
+        ({"camera_model": "omni"}, "model 'omni' is not supported, expected plumb_bob .pinhole"),
         ({"intrinsics": [1.0, 2.0]}, "intrinsics must hold 4 numbers, got 2"),
         ({"intrinsics": None, "camera_model": "pinhole"}, "lacks camera_matrix, intrinsics or fx,"),
         ({"resolution": None}, "lacks width and height of the images"),
@@ -472,7 +472,7 @@ def test_a_stereo_pair_is_two_cameras(tmp_path: Path, tiny: Any) -> None:
         ({"T_cn_cnm1": np.eye(4).tolist()}, "side by side"),
         ({"T_cn_cnm1": None, "T_cam_imu": None}, "the baseline must be positive, got none"),
         ({"T_cam_imu": "none"}, "T_cam_imu must hold numbers"),
-        ({"distortion_model": "fov"}, "distortion model 'fov' is not supported"),
+        ({"distortion_model": "fov"}, "model 'fov' is not supported"),
         ({"distortion_coeffs": [0.1]}, "D of radtan must hold 4 or 5 numbers, got 1"),
         ({"distortion_coeffs": {"k1": 0.1}}, "D must hold numbers"),
     ],
