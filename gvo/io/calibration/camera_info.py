@@ -120,7 +120,9 @@ def make_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibration
     it; `do_rectify` does not matter there either. Of rectified images only P counts.
     """
     K, R, P = _matrices(fields)
-    doubt = _doubt(P if is_rectified else K, fields)
+    doubt = _doubt("P", P, fields)
+    if not is_rectified or np.array_equal(K, P[:, :3]):
+        doubt = _doubt("K", K, fields) or doubt
     model, D = _distortion(fields, is_rectified=is_rectified)
     width, height = fields.recorded_size()
     binning, roi = fields.binning_factors, fields.roi
@@ -150,8 +152,8 @@ def make_rgbd_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibr
     return calibration
 
 
-def _doubt(K: FloatArray, fields: CameraFields) -> str:
-    """Say which images K fits, where its principal point is far from the centre of these.
+def _doubt(name: str, K: FloatArray, fields: CameraFields) -> str:
+    """Say which images K or P fits, where its principal point is far from the centre of these.
 
     What is cut out of an image has it elsewhere, too, but seldom by such a share of both sides.
     """
@@ -170,8 +172,8 @@ def _doubt(K: FloatArray, fields: CameraFields) -> str:
     width, height = np.rint(size / factor if is_even else size * shares).astype(int)
     what = "image" if fields.binning_factors == (1, 1) else "image before binning"
     return (
-        f"K fits an image of {width}x{height}, the {what} is {size[0]}x{size[1]}"
-        f"{f': factor {factor:.3g}' if is_even else ''}; give the K of these images by "
+        f"{name} fits an image of {width}x{height}, the {what} is {size[0]}x{size[1]}"
+        f"{f': factor {factor:.3g}' if is_even else ''}; give that of these images by "
         "--calibration FILE, unless they were cut out of larger ones"
     )
 
