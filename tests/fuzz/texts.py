@@ -78,10 +78,17 @@ Camera1.fy: 190.9
 Camera1.cx: 254.9
 Camera1.cy: 256.8
 Camera1.k1: 0.003
+Camera1.k2: 0.001
+Camera1.k3: -0.002
+Camera1.k4: 0.0
 Camera2.fx: 190.4
 Camera2.fy: 190.4
 Camera2.cx: 252.5
 Camera2.cy: 254.9
+Camera2.k1: 0.003
+Camera2.k2: 0.001
+Camera2.k3: -0.002
+Camera2.k4: 0.0
 Camera.width: 512
 Camera.height: 512
 Stereo.T_c1_c2: !!opencv-matrix
@@ -289,7 +296,9 @@ def _calibration(data: bytes) -> None:
     uses: list[tuple[Sensor, bool]] = [("stereo", False), ("stereo", True), ("rgbd", False)]
     for sensor, is_rectified in uses:
         try:
-            cameras = read_cameras(path, sensor=sensor, is_rectified=is_rectified)
+            cameras = read_cameras(
+                path, sensor=sensor, is_rectified=is_rectified, image_size=lambda: (48, 32)
+            )
         except GvoError as error:
             refusals.append(error)
         else:

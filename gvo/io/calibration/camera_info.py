@@ -160,7 +160,7 @@ def _doubt(name: str, K: FloatArray, fields: CameraFields) -> str:
     size = np.array([max(fields.width, 1), max(fields.height, 1)])
     shares = (2.0 * K[:2, 2] + 1.0) / size
     low, high = float(np.min(shares)), float(np.max(shares))
-    half_view = size[0] / (2.0 * K[0, 0])
+    half_view = size[0] / (2.0 * max(K[0, 0], 1.0))
     is_larger = low >= _LEAST_LARGER and half_view <= _WIDEST_LARGER
     is_smaller = high <= _MOST_SMALLER and half_view >= _NARROWEST_SMALLER
     if not (is_larger or is_smaller) or not 1.0 / _MAX_FACTOR <= low <= high <= _MAX_FACTOR:

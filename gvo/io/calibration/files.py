@@ -93,15 +93,13 @@ def read_cameras(
         When a file is malformed, or they do not describe such a camera.
     """
     files = [file for path in paths_of(paths) for file in _files_of(path)]
-    contents = [read_calibration_file(file) for file in files]
-    cameras = [camera for content in contents for camera in content.cameras]
-    cameras = [_sized(camera, image_size) for camera in cameras]
+    described = [camera for file in files for camera in read_calibration_file(file)]
+    cameras = [_sized(camera, image_size) for camera in described]
     origin = " + ".join(dict.fromkeys(str(file) for file in files))
     if sensor == "stereo":
         chosen = cameras[first : first + 2] if len(cameras) > 2 else cameras
         return _stereo_set(chosen, origin, is_rectified=is_rectified)
-    depth_scale = contents[0].depth_scale if contents else None
-    return _rgbd_set(cameras, origin, depth_scale, is_rectified=is_rectified)
+    return _rgbd_set(cameras, origin, is_rectified=is_rectified)
 
 
 def paths_of(calibration: CalibrationPaths, *own: Path) -> tuple[Path, ...]:
@@ -185,9 +183,7 @@ def _extrinsics(left: DescribedCamera, right: DescribedCamera) -> tuple[FloatArr
     return None, "P"
 
 
-def _rgbd_set(
-    cameras: list[DescribedCamera], origin: str, depth_scale: float | None, *, is_rectified: bool
-) -> CameraSet:
+def _rgbd_set(cameras: list[DescribedCamera], origin: str, *, is_rectified: bool) -> CameraSet:
     if len(cameras) != 1:
         raise CalibrationError(
             f"{origin}: expected one camera, that of the colour images, got {len(cameras)}: give "
@@ -198,7 +194,7 @@ def _rgbd_set(
         calibrations=(calibration,),
         origin=origin,
         T_body_cam=_on_body(cameras[0], calibration),
-        depth_scale=depth_scale,
+        depth_scale=cameras[0].depth_scale,
     )
 
 

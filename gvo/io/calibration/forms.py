@@ -75,37 +75,30 @@ class DescribedCamera:
         Maps the raw camera before it in a chain to this one (Kalibr: T_cn_cnm1), metres.
     focal_x_baseline : float, optional
         Of a rectified pair whose cameras are both like this one, pixels times metres.
+    depth_scale : float, optional
+        Counts per metre of integer depth.
     """
 
     fields: CameraFields
     T_body_cam: FloatArray | None = None
     T_cam_previous: FloatArray | None = None
     focal_x_baseline: float | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class CalibrationFile:
-    """One camera, a pair or a chain; and the counts per metre of integer depth."""
-
-    cameras: tuple[DescribedCamera, ...]
     depth_scale: float | None = None
 
 
-def read_calibration_file(path: Path) -> CalibrationFile:
-    """Read a calibration file in any form of `FORMS`, or with the rows P0, P1, ... of KITTI.
+def read_calibration_file(path: Path) -> tuple[DescribedCamera, ...]:
+    """Read a camera, a pair or a chain in any form of `FORMS`, or the rows P0, P1, ... of KITTI.
 
-    It may hold the counts per metre of depth: `depth_scale`, or what ORB-SLAM and stella_vslam
+    A file may hold the counts per metre of depth: `depth_scale`, or what ORB-SLAM and stella_vslam
     call their factor.
     """
     text = _read(path)
     rows = sorted(_KITTI_ROW.findall(text))
     if rows:
-        cameras = [_described({"P": row.split()}, f"{path}: P{n}") for n, row in rows]
-        return CalibrationFile(cameras=tuple(cameras))
+        return tuple(_described({"P": row.split()}, f"{path}: P{n}") for n, row in rows)
     content = _load(text, path)
-    return CalibrationFile(
-        cameras=_cameras(content, path, FORMS), depth_scale=_depth_scale(content, path)
-    )
+    scale = _depth_scale(content, path)
+    return tuple(replace(each, depth_scale=scale) for each in _cameras(content, path, FORMS))
 
 
 def _cameras(content: Content, path: Path, forms: Iterable[Form]) -> tuple[DescribedCamera, ...]:
@@ -221,27 +214,27 @@ def _fields(content: Content, where: str) -> CameraFields:
     )
 
 
-def _K(content: Content, values: Content, where: str) -> Any:  # noqa: ANN401, N802 - YAML
+def _K(content: Content, values: Content, where: str) -> FloatArray:  # noqa: N802 - its name
     """Return K, of a matrix, a list or numbers with keys of their own; zeros beside P alone."""
     if values["K"] is not None:
-        return values["K"]
+        return read_array(values["K"], (3, 3), f"{where}: K")
     if "intrinsics" in content:
         fx, fy, cx, cy = _array(content, "intrinsics", (4,), where)
     elif all(name in content for name in _PINHOLE):
         fx, fy, cx, cy = read_array([content[name] for name in _PINHOLE], (4,), f"{where}: fx, ...")
     elif values["P"] is not None:
-        return np.zeros(9)
+        return np.zeros((3, 3))
     else:
         missing = ", ".join(name for name in _PINHOLE if name not in content)
         raise CalibrationError(f"{where}: lacks camera_matrix, intrinsics or {missing}; {_KNOWN}")
-    return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def _focal_x_baseline(content: Content, fields: CameraFields, where: str) -> float | None:
     for key in ("bf", "focal_x_baseline", "b"):
         if key in content:
-            fx = float(np.ravel(np.asarray(fields.K))[0]) if key == "b" else 1.0
-            return fx * float(_array(content, key, (1,), where)[0])
+            fx = np.ravel(fields.K)[0] if key == "b" else 1.0
+            return float(fx * _array(content, key, (1,), where)[0])
     return None
 
 
@@ -280,8 +273,10 @@ def _transform(content: Content, keys: Mapping[str, bool], where: str) -> FloatA
     key = next((key for key in keys if key in content), None)
     if key is None:
         return None
-    n_rows = 3 if np.size(_data(content[key])) == 12 else 4  # ORB-SLAM left the last one out
-    T = np.vstack([_array(content, key, (n_rows, 4), where), np.eye(4)[n_rows:]])
+    numbers = read_numbers(_data(content[key]), f"{where}: {key}")
+    if numbers.size == 12:
+        numbers = np.concatenate([numbers, np.eye(4)[3]])  # ORB-SLAM left the last row out
+    T = read_array(numbers, (4, 4), f"{where}: {key}")
     T[3] = np.round(T[3], 6)  # programs that invert transforms write their rounding
     fault = se3.transform_fault(T, tolerance=ROTATION_TOLERANCE)
     if fault:

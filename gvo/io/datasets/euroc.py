@@ -83,7 +83,7 @@ def _pose_on_body(cameras: CameraSet, sensor: Path) -> FloatArray:
     """Return T_body_cam of the rectified left camera, of the folder's own file if need be."""
     if cameras.T_body_cam is not None:
         return cameras.T_body_cam
-    (described,) = read_calibration_file(sensor).cameras
+    (described,) = read_calibration_file(sensor)
     if described.T_body_cam is None:
         raise CalibrationError(f"{sensor}: T_BS must hold 16 numbers, it is missing")
     return pose_of_rectified(described.T_body_cam, cameras.calibrations[0])

@@ -50,6 +50,7 @@ def test_what_is_not_set_is_made_up_from_the_other_matrix() -> None:
         ({"K": [np.nan, *_K[1:]]}, "not finite"),
         ({"K": ["a"] * 9}, "K must hold numbers"),
         ({"P": [-40.0, *_P[1:]]}, "focal lengths must be positive"),
+        ({"P": [0.0, *_P[1:]]}, "focal lengths must be positive"),
         ({"R": 2 * np.eye(3)}, "R is not a rotation"),
         ({"K": [1e300, *_K[1:]]}, "K holds 1e.300"),
         ({"K": [10**400, *_K[1:]]}, "K must hold numbers"),
