@@ -166,9 +166,8 @@ def _twin(left: DescribedCamera, origin: str) -> DescribedCamera:
     """Return the right camera of a rectified pair, of which the file describes one camera."""
     if left.focal_x_baseline is None:
         raise CalibrationError(
-            f"{origin}: holds one camera, expected two of a stereo pair: the keys left and right, "
-            "cam0 and cam1, or two files; or one camera with its baseline (Stereo.b, Camera.bf, "
-            "focal_x_baseline)"
+            f"{origin}: holds one camera, expected two of a stereo pair (left and right, cam0 and "
+            "cam1, or two files), or its baseline (Stereo.b, Camera.bf, focal_x_baseline)"
         )
     P = np.hstack([np.reshape(left.fields.K, (3, 3)), [[-left.focal_x_baseline], [0.0], [0.0]]])
     return replace(left, fields=replace(left.fields, P=P))

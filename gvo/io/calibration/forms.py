@@ -317,9 +317,9 @@ def _load(text: str, path: Path) -> dict[Any, Any]:
         # Of several documents, as `ros2 topic echo` prints them, the first counts.
         content = load_yaml(text, _Loader)
     except YamlError as error:
-        raise CalibrationError(f"{path}: the calibration is not YAML ({error})") from error
+        raise CalibrationError(f"{path}: not YAML ({error}); {_KNOWN}") from error
     if not isinstance(content, dict):
-        raise CalibrationError(f"{path}: the calibration holds no keys")
+        raise CalibrationError(f"{path}: holds no keys; {_KNOWN}")
     return content
 
 
