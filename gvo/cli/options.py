@@ -116,8 +116,8 @@ def _make_excerpt(
     return make_excerpt(start, duration, every)
 
 
-def _topic(images: str) -> Any:  # noqa: ANN401 - has no public type
-    return Option(metavar="TOPIC", help=f"Topic of the {images} images.")
+def _topic(what: str) -> Any:  # noqa: ANN401 - has no public type
+    return Option(metavar="TOPIC", help=f"Topic of {what}.")
 
 
 def _recording_options(
@@ -129,15 +129,19 @@ def _recording_options(
             "KITTI that replaces the recording's own. May be repeated.",
         ),
     ] = None,
-    left: Annotated[str | None, _topic("left")] = None,
-    right: Annotated[str | None, _topic("right")] = None,
-    color: Annotated[str | None, _topic("colour")] = None,
-    depth: Annotated[str | None, _topic("depth")] = None,
+    left: Annotated[str | None, _topic("the left images")] = None,
+    right: Annotated[str | None, _topic("the right images")] = None,
+    color: Annotated[str | None, _topic("the colour images")] = None,
+    depth: Annotated[str | None, _topic("the depth images")] = None,
+    camera_info: Annotated[
+        list[str] | None, _topic("CameraInfo: left, then right; or colour, then depth")
+    ] = None,
 ) -> "RecordingOptions":
     from gvo.io.opening import RecordingOptions
 
+    topics: dict[str, Any] = {"left": left, "right": right, "color": color, "depth": depth}
     return RecordingOptions(
-        calibration=tuple(calibration or ()), left=left, right=right, color=color, depth=depth
+        calibration=tuple(calibration or ()), camera_info=tuple(camera_info or ()), **topics
     )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo.geometry import se3
-from gvo.geometry.camera import Calibration, rectification_maps
+from gvo.geometry.camera import Calibration
 from gvo.io.recording import DepthView
 from gvo.types import DepthArray, FloatArray, IntArray
 
@@ -65,9 +65,6 @@ class DepthRegistration:
             raise ValueError(f"T_color_depth {fault}, got {view.T_color_depth.tolist()}")
         self._shape = (color.height, color.width)
         self._depth_shape = (view.calibration.height, view.calibration.width)
-        self._is_done = _is_done(color, view)
-        if self._is_done:
-            return
         R_color_depth, t_color_depth = view.T_color_depth[:3, :3], view.T_color_depth[:3, 3]
         K_color = color.P[:, :3]
         rays = _rays(view.calibration)
@@ -84,8 +81,6 @@ class DepthRegistration:
         """Return metres (h, w) in the rectified colour image, NaN = unknown, of those recorded."""
         if depth.shape != self._depth_shape:
             raise ValueError(f"expected depth of shape {self._depth_shape}, got {depth.shape}")
-        if self._is_done:
-            return np.asarray(depth, dtype=np.float32)
         return _close_gaps(self._paint(depth), self._square)
 
     def _paint(self, depth: DepthArray) -> DepthArray:
@@ -122,17 +117,6 @@ def _close_gaps(painted: DepthArray, square: NDArray[np.uint8]) -> DepthArray:
     closed = np.where(is_gap, opened, painted)
     closed[closed == _NOTHING] = np.nan
     return closed
-
-
-def _is_done(color: Calibration, view: DepthView) -> bool:
-    """Tell whether the depth is registered to the rectified colour image already."""
-    depth = view.calibration
-    return (
-        np.allclose(view.T_color_depth, np.eye(4), rtol=0, atol=1e-9)
-        and (depth.width, depth.height) == (color.width, color.height)
-        and rectification_maps(depth) is None
-        and np.allclose(depth.P[:, :3], color.P[:, :3], rtol=0, atol=1e-6)
-    )
 
 
 def _rays(calibration: Calibration) -> FloatArray:

@@ -26,7 +26,7 @@ _KINDS = (
 # By such a name in it a folder is known to be one recording.
 FOLDER_MARKERS = ("metadata.yaml", "calib.txt", "times.txt", "mav0", "cam0", "rgb.txt")
 _PACKED = (".gz", ".bz2", ".xz", ".zst", ".zstd", ".lz4", ".zip", ".tar", ".tgz", ".7z")
-_TOPICS = ("left", "right", "color", "depth")
+_TOPICS = ("left", "right", "color", "depth", "camera_info")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,6 +39,8 @@ class RecordingOptions(TopicChoice):
         Topics of a stereo pair in a bag.
     color, depth : str, optional
         Topics of an RGB-D camera in a bag.
+    camera_info : tuple of str
+        Topics of `CameraInfo` in a bag: of left, then right; or of colour, then depth.
     calibration : Path or sequence of Path
         Files that replace the recording's own calibration: one or two, or a folder.
     """
@@ -106,8 +108,9 @@ def is_bag(path: Path) -> bool:
 
 def _open_folder(path: Path, config: Config, options: RecordingOptions) -> Source:
     for name in _TOPICS:
-        if getattr(options, name) is not None:
-            raise RecordingError(f"{path}: --{name} chooses a topic of a bag, this is not a bag")
+        if getattr(options, name):
+            flag = f"--{name.replace('_', '-')}"
+            raise RecordingError(f"{path}: {flag} chooses a topic of a bag, this is not a bag")
     if _is_kitti(path):
         return KittiSource(path, calibration=options.calibration, config=config)
     if (path / "mav0").is_dir() or (path / "cam0").is_dir():
@@ -121,11 +124,11 @@ def _what_is_missing(path: Path) -> str:
     """Say what keeps a path from being a recording, where it looks like one."""
     if path.suffix in _PACKED:
         return "packed files are not read; unpack it first"
-    lists = sorted(path.glob("*assoc*.txt"))
-    if not lists and not all((path / name).is_dir() for name in ("rgb", "depth")):
+    lists = [each.name for each in path.glob("*assoc*.txt")]
+    if not (lists or all((path / name).is_dir() for name in ("rgb", "depth"))):
         return ""
     words = "rgb.txt and depth.txt are missing, each with rows of a stamp and a file"
-    return f"{words}; write them from the columns of {lists[0].name}" if lists else words
+    return f"{words}; write them from the columns of {lists[0]}" if lists else words
 
 
 def _is_kitti(path: Path) -> bool:

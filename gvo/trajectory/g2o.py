@@ -38,7 +38,7 @@ _SWAPPED_ORDER = _ORDER[np.ix_(_SWAPPED, _SWAPPED)]
 _NORM_TOLERANCE = 1e-2
 _ROUNDING = 1e-9  # of an information matrix, relative
 _AXES = ("x", "y", "z", "roll", "pitch", "yaw")
-_KINDS = {("z", "roll", "pitch"): ": a planar graph", _AXES: ": the edge says nothing"}
+_KINDS = {"z, roll, pitch": ": a planar graph", ", ".join(_AXES): ": the edge says nothing"}
 _QUATERNION_TAGS = ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")
 _ANGLE_TAGS = ("VERTEX3", "EDGE3")
 
@@ -142,9 +142,7 @@ def _numbers(fields: list[str]) -> tuple[list[int], list[float]]:
     if tag == "EDGE3" and len(fields) == 1 + n_ids + n_pose:
         fields = fields + _UNIT_INFORMATION
     if len(fields) != n_expected:
-        without = n_ids == 2 and len(fields) == 1 + n_ids + n_pose
-        why = "; the information matrix is missing" if without else ""
-        raise ValueError(f"{tag} needs {n_expected - 1} numbers, got {len(fields) - 1}{why}")
+        raise ValueError(f"{tag} needs {n_expected - 1} numbers, got {len(fields) - 1}")
     ids = [_id(field) for field in fields[1 : 1 + n_ids]]
     return ids, plain_floats(fields[1 + n_ids :])
 
@@ -159,14 +157,12 @@ def _lines_of(tag: str, rows: Sequence[tuple[int, list[int], list[float]]]) -> I
             yield Vertex(frame_id=ids[0], T_world_frame=T)
         return
     order = _SWAPPED_ORDER if tag in _QUATERNION_TAGS else _ORDER
-    noises = _noises(numbers[:, n_pose:][:, order])
-    for (_, ids, _), T, (covariance, fault) in zip(rows, transforms, noises, strict=True):
+    information = numbers[:, n_pose:][:, order]
+    faults = [_fault(matrix) for matrix in information]
+    noises = zip(_inverses(information, faults), faults, strict=True)
+    for (_, (a, b), _), T, (covariance, fault) in zip(rows, transforms, noises, strict=True):
         yield Measurement(
-            reference_id=ids[0],
-            frame_id=ids[1],
-            T_reference_frame=T,
-            covariance=covariance,
-            fault=fault,
+            reference_id=a, frame_id=b, T_reference_frame=T, covariance=covariance, fault=fault
         )
 
 
@@ -200,39 +196,30 @@ def transforms_of(numbers: FloatArray) -> FloatArray:
     return se3.make_transform(np.asarray(R), numbers[:, :3])
 
 
-def _noises(information: FloatArray) -> Iterator[tuple[FloatArray, str]]:
-    """Yield the inverse of each information matrix, shape (n, 6, 6), or what is wrong with it."""
-    covariances = _inverses(information)
-    if covariances is not None:
-        for covariance in covariances:
-            yield 0.5 * covariance + 0.5 * covariance.T, ""  # halves first: no overflow
-    elif len(information) == 1:
-        yield np.full((6, 6), np.nan), _information_fault(information[0])
-    else:
-        for matrix in information:
-            yield from _noises(matrix[np.newaxis])
+def _inverses(information: FloatArray, faults: Sequence[str]) -> FloatArray:
+    """Return the inverses of matrices, shape (n, 6, 6); NaN of those with a fault."""
+    is_sound = np.array([not fault for fault in faults], dtype=np.bool_)
+    inverses = np.full_like(information, np.nan)
+    inverses[is_sound] = np.linalg.inv(information[is_sound])
+    # halves first: no overflow
+    return np.asarray(0.5 * inverses + 0.5 * inverses.transpose(0, 2, 1))
 
 
-def _inverses(matrices: FloatArray) -> FloatArray | None:
-    """Return the inverses of positive definite matrices; None if one is not."""
-    try:
-        np.linalg.cholesky(matrices)
-        return np.asarray(np.linalg.inv(matrices)) if np.isfinite(matrices).all() else None
-    except np.linalg.LinAlgError:
-        return None
-
-
-def _information_fault(information: FloatArray) -> str:
-    """Say why a matrix of (rx, ry, rz, tx, ty, tz) is no information."""
-    if not np.all(np.isfinite(information)):
-        return "information is not finite"
+def _fault(information: FloatArray) -> str:
+    """Say why a matrix of (rx, ry, rz, tx, ty, tz) is no information; empty if it is one."""
+    fault = se3.covariance_fault(information)
+    if not fault.endswith("definite"):
+        return f"information {fault}" if fault else ""
     values = np.linalg.eigvalsh(information)
-    if values[0] < -_ROUNDING * values[-1] or values[-1] < 0.0:
+    if values[0] < -_ROUNDING * np.abs(values).max():
         return "information is not positive definite"
-    rows = information[_SWAPPED]
-    names = [name for name, row in zip(_AXES, rows, strict=True) if not np.any(row)]
-    zeros = f" ({', '.join(names)} are zero{_KINDS.get(tuple(names), '')})" if names else ""
-    return f"information is singular{zeros}"
+    rows = zip(_AXES, information[_SWAPPED], strict=True)
+    zeros = ", ".join(name for name, row in rows if not np.any(row))
+    return (
+        f"information is singular ({zeros} are zero{_KINDS.get(zeros, '')})"
+        if zeros
+        else "information is singular"
+    )
 
 
 def format_vertex(frame_id: int | str, T_world_frame: FloatArray) -> str:

@@ -156,13 +156,3 @@ def _undistorted_by_opencv(raw: Calibration, model: str) -> FloatArray:
     undistort = cv2.fisheye.undistortPoints if model == "equidistant" else cv2.undistortPoints
     xy = np.asarray(undistort(pixels, raw.K, raw.D)).reshape(-1, 2)
     return np.hstack([xy, np.ones((len(xy), 1))])
-
-
-@pytest.mark.parametrize("is_rectified", [True, False])
-def test_the_view_of_the_colour_camera_itself_changes_no_bit(is_rectified: bool) -> None:
-    calibration = replace(Calibration.from_camera(_COLOR), is_rectified=is_rectified)
-    view = DepthView(calibration=calibration, T_color_depth=np.eye(4))
-    depth = np.random.default_rng(0).uniform(0.5, 8.0, (480, 640)).astype(np.float32)
-    depth[100:120, 50:90] = np.nan
-    registered = DepthRegistration(Calibration.from_camera(_COLOR), view)(depth)
-    np.testing.assert_array_equal(registered, depth)

@@ -136,7 +136,7 @@ def test_what_is_wrong_with_an_information_matrix_is_said(
         ("VERTEX_SE3:QUAT 0 1 2 x 0 0 0 1", "x"),
         ("VERTEX_SE3:QUAT 0 1 2 3 0 0 0 2", "length 2"),
         ("VERTEX_SE3:QUAT 0 1 2 3 0 0 0 nan", "length nan"),
-        ("EDGE_SE3:QUAT 0 1 1 2 3 0 0 0 1", "needs 30 numbers, got 9; the information .* missing"),
+        ("EDGE_SE3:QUAT 0 1 1 2 3 0 0 0 1", "needs 30 numbers, got 9"),
     ],
 )
 def test_a_malformed_line_is_refused(text: str, words: str) -> None:

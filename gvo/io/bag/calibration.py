@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -37,11 +38,10 @@ TRANSFORM_TYPE = "geometry_msgs/msg/Transform"
 
 # The topics of one stream of a bag that librealsense wrote.
 _REALSENSE_STREAM = re.compile(r"(/device_\d+/sensor_\d+/[^/]+)/image/data")
-_REGISTERED = re.compile(r"(?<!un)(aligned|registered)")
-# Of the focal length and of the image size: calibrations of one camera differ by less.
-_TOLERANCE = 0.02
+# Of the focal length and of the image size: calibrations of one camera differ by less, numbers that
+# a driver copied or scaled by much less.
+_TOLERANCE, _SAME = 0.02, 0.005
 _SAME_PLACE_M = 1e-6
-_SAME_PIXEL_PX = 0.5
 _REMEDY = "give a topic of depth registered to colour by --depth"
 
 
@@ -55,26 +55,29 @@ class BagCalibration:
     depth_view: DepthView | None = None
     frame_id: str = ""
     T_body_cam: FloatArray | None = None
+    info_names: tuple[str, ...] = ()
 
 
 def calibrations_of_messages(
-    reader: MessageReader, topics: CameraTopics, where: str
+    reader: MessageReader, topics: CameraTopics, where: str, names: Sequence[str] = ()
 ) -> BagCalibration:
     """Read the first `CameraInfo` of a stereo pair, or of the colour camera.
 
     A raw pair whose P hold no baseline is rectified by the transform between the cameras. Later
     messages are not read, which would take a pass over the bag: `camera_info_changes` does.
     """
-    first, second = read_bag_cameras(reader, topics, where)
+    first, second = read_bag_cameras(reader, topics, where, names)
+    info_names = tuple(camera.info_name for camera in (first, second) if camera is not None)
     frame_id = first.fields.frame_id or image_frame(reader, topics.first)
     is_rectified = topics.first.is_rectified
     state = "rectified" if is_rectified else "raw, rectified by D, R and P"
     if second is not None and topics.sensor == "stereo":
         pair, baseline = _stereo_pair(reader, (first, second), where)
-        names = f"{first.info_name} + {second.info_name}"
-        line = f"calibration: {names}; the images are {state}"
+        line = f"calibration: {' + '.join(info_names)}; the images are {state}"
         decisions = (line, *first.notes, *second.notes, baseline)
-        return BagCalibration(calibrations=pair, decisions=decisions, frame_id=frame_id)
+        return BagCalibration(
+            calibrations=pair, decisions=decisions, frame_id=frame_id, info_names=info_names
+        )
     decisions = (f"calibration: {first.info_name}; the images are {state}", *first.notes)
     color = make_rgbd_calibration(first.fields, is_rectified=is_rectified)
     view, found = None, ""
@@ -86,6 +89,7 @@ def calibrations_of_messages(
         depth_scale=recorded_depth_scale(reader, topics.second),
         depth_view=view,
         frame_id=frame_id,
+        info_names=info_names,
     )
 
 
@@ -149,11 +153,10 @@ def _depth_view(
 ) -> tuple[DepthView | None, str]:
     """Return the camera of depth that has to be registered to colour, and a line on it.
 
-    It is registered already where the name of the topic says so, and where both cameras have one
-    frame, one size and the same intrinsics; None where it is, or where that is not known.
+    Both are at one place where their frame is one, or where the topic's name says that depth is
+    registered and the intrinsics are the same; None where the size and the intrinsics are the same
+    too, or where the place is not known.
     """
-    if _REGISTERED.search(depth.image.base.lower()):
-        return None, ""
     try:
         calibration = make_rgbd_calibration(depth.fields, is_rectified=depth.image.is_rectified)
     except CalibrationError as error:
@@ -161,8 +164,13 @@ def _depth_view(
     difference = _difference(color, calibration)
     frames = (camera.fields.frame_id, depth.fields.frame_id)
     found: tuple[FloatArray, str] | Failure = (np.eye(4), f"one frame {frames[0]}")
-    if not frames[0] or frames[0] != frames[1]:
+    if depth.image.is_registered and not _difference(color, calibration, _SAME):
+        found = np.eye(4), "its name"
+    elif not frames[0] or frames[0] != frames[1]:
         found = _find_extrinsics(reader, camera, depth)
+    if (calibration.width, calibration.height) != (color.width, color.height):
+        size = f"{calibration.width}x{calibration.height} pixels"
+        difference = f"images of {size}, colour {color.width}x{color.height}"
     if isinstance(found, Failure):
         return None, _advice(difference, frames, found)
     T_color_depth, origin = found
@@ -174,26 +182,22 @@ def _depth_view(
     return DepthView(calibration=calibration, T_color_depth=T_color_depth), line
 
 
-def _difference(color: Calibration, depth: Calibration) -> str:
-    """Say how two cameras differ; empty where they do not."""
-    if (depth.width, depth.height) != (color.width, color.height):
-        return f"images of {depth.width}x{depth.height} pixels, colour {color.width}x{color.height}"
-    first, second = color.pinhole(), depth.pinhole()
-    sizes = {"fx": first.fx, "fy": first.fy, "cx": first.width, "cy": first.height}
-    for name, size in sizes.items():
-        of_color, of_depth = float(getattr(first, name)), float(getattr(second, name))
-        if abs(of_depth - of_color) > _TOLERANCE * size:
-            return f"{name} {of_depth:.1f} against {of_color:.1f} px"
-    return "" if _is_one_lens(color, depth) else "another lens"
-
-
-def _is_one_lens(color: Calibration, depth: Calibration) -> bool:
-    """Tell whether raw images of both are rectified alike, or need not be rectified."""
-    maps = [rectification_maps(camera) for camera in (color, depth)]
-    if maps[1] is None or maps[0] is None:
-        # Depth without a lens of its own is what drivers give that register it to raw colour.
-        return maps[1] is None
-    return all(np.allclose(a, b, atol=_SAME_PIXEL_PX) for a, b in zip(*maps, strict=True))
+def _difference(color: Calibration, depth: Calibration, tolerance: float = _TOLERANCE) -> str:
+    """Say how the views of two cameras differ, apart from resolution; empty where they do not."""
+    has_lens, depth_has_lens = (rectification_maps(each) is not None for each in (color, depth))
+    K, K_depth, sizes = color.P, depth.P, (color.width, color.height)
+    scales = color.width / depth.width, color.height / depth.height
+    if has_lens and not depth_has_lens:
+        # Drivers that register depth to raw colour give it the K of colour, without a lens.
+        K, tolerance = color.K, _SAME
+    for axis, size, scale in zip((0, 1), sizes, scales, strict=True):
+        f, c, f_depth, c_depth = *K[axis, [axis, 2]], *K_depth[axis, [axis, 2]]
+        if abs(scale * f_depth - f) > tolerance * f:
+            return f"f{'xy'[axis]} {f_depth:.1f} against {f:.1f} px"
+        if abs(scale * (c_depth + 0.5) - 0.5 - c) > tolerance * size:
+            return f"c{'xy'[axis]} {c_depth:.1f} against {c:.1f} px"
+    is_one_lens = color.model == depth.model and np.array_equal(color.D, depth.D)
+    return "another lens" if depth_has_lens and not is_one_lens else ""
 
 
 def _advice(difference: str, frames: tuple[str, str], why: Failure) -> str:

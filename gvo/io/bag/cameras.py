@@ -27,8 +27,9 @@ from gvo.io.bag.topics import (
     IMAGE_TYPES,
     CameraTopics,
     Topic,
-    camera_info_names,
-    find_camera_info,
+    camera_info_topics,
+    describe_topics,
+    find_topic,
 )
 from gvo.io.calibration.camera_info import CameraFields
 
@@ -59,31 +60,64 @@ class BagCamera:
 
 
 def read_bag_cameras(
-    reader: MessageReader, topics: CameraTopics, where: str
+    reader: MessageReader, topics: CameraTopics, where: str, names: Sequence[str] = ()
 ) -> tuple[BagCamera, BagCamera | None]:
     """Read the first `CameraInfo` of both image topics; None where depth has none.
+
+    Their topics are those of the names, as far as these go.
 
     Raises
     ------
     CalibrationError
         When a `CameraInfo` is missing.
     """
-    is_depth = topics.sensor == "rgbd"
-    names = [find_camera_info(image, reader.topics) for image in (topics.first, topics.second)]
-    messages = _first_messages(reader, {name for name in names if name is not None})
     cameras = []
-    for image, name in zip((topics.first, topics.second), names, strict=True):
-        is_needed = image is topics.first or not is_depth
-        if is_needed and name is None:
+    infos = [t for t in reader.topics if t.type == CAMERA_INFO_TYPE and t.n_messages > 0]
+    for n, image in enumerate((topics.first, topics.second)):
+        name = "".join(names[n : n + 1])
+        info = find_topic(name, infos) if name else _find_info(reader, image, infos)
+        content = None if info is None else _first_messages(reader, {info.name}).get(info.name)
+        if info is not None and content is not None:
+            cameras.append(_bag_camera(reader, image, (info.name, content), where))
+        elif name or n == 0 or topics.sensor == "stereo":
+            held = describe_topics(infos) or "none"
             raise CalibrationError(
-                f"{where}: no CameraInfo for {image.name}: expected "
-                f"/{camera_info_names(image)[0]}; give --calibration FILE"
+                f"{where}: no CameraInfo for {image.name}{' on ' * bool(name)}{name}, it holds "
+                f"{held}; give {'--camera-info TOPIC or ' * bool(infos)}--calibration FILE"
             )
-        if is_needed and name not in messages:
-            raise CalibrationError(f"{where}: {name} yields no message; give --calibration FILE")
-        if name is not None and name in messages:
-            cameras.append(_bag_camera(reader, image, (name, messages[name]), where))
     return cameras[0], cameras[1] if len(cameras) > 1 else None
+
+
+def _find_info(reader: MessageReader, image: Topic, infos: Sequence[Topic]) -> Topic | None:
+    """Return the topic of an image's `CameraInfo`: by place and name, if size and frame allow it.
+
+    If they do not, it is one elsewhere with the size and the frame of the images.
+    """
+    frame_id, size = "", (0, 0)
+    with suppress(CalibrationError, RecordingError):  # as of a network, before the first image
+        frame_id, size = image_frame(reader, image), image_size(reader, image)
+    best, found = 0, None
+    for topic, is_near in camera_info_topics(image, infos):
+        its_size, its_frame = _stated(reader, topic)
+        is_other_size = size != its_size and 0 not in (*size, *its_size)
+        is_other = is_other_size or (frame_id != its_frame and "" not in (frame_id, its_frame))
+        is_its_own = size == its_size and frame_id == its_frame != ""
+        rank = (1 if is_other else 3) if is_near else 2 * is_its_own
+        if rank > best:
+            best, found = rank, topic
+        if best == 3:
+            break
+    return found
+
+
+def _stated(reader: MessageReader, info: Topic) -> tuple[tuple[int, int], str]:
+    """Return the size and the frame that a `CameraInfo` states; zeros and "" where it does not."""
+    with suppress(CalibrationError, RecordingError):
+        content = _first_messages(reader, {info.name}).get(info.name)
+        if content is not None:
+            fields = camera_fields(content, info.name)
+            return fields.recorded_size(), fields.frame_id
+    return (0, 0), ""
 
 
 class CameraInfoWatch:

@@ -29,7 +29,6 @@ from gvo.io.bag.topics import (
     Topic,
     TopicChoice,
     choose_topics,
-    find_camera_info,
 )
 from gvo.io.calibration.files import CalibrationPaths, paths_of
 from gvo.io.images import MILLIMETRES, GreyRange
@@ -122,16 +121,18 @@ class BagSource:
         self._reader, self._where = reader, where
         self._tf: TfBuffer | None = None
         self._takes_log_time = config.sync.stamps == "recording"
-        is_given = bool(paths_of(calibration))
-        self._topics = self._choose_topics(topics or TopicChoice())
-        images = (self._topics.first, self._topics.second)
-        infos = [find_camera_info(image, reader.topics) for image in images]
-        self._info_names = set() if is_given else {name for name in infos if name}
+        topics = topics or TopicChoice()
+        if len(topics.camera_info) > (0 if paths_of(calibration) else 2):
+            raise RecordingError(
+                f"{where}: give at most two --camera-info, or --calibration instead"
+            )
+        self._topics = self._choose_topics(topics)
         self._watch = CameraInfoWatch()
-        if is_given:
+        if paths_of(calibration):
             found = calibrations_of_file(calibration, self._topics, reader)
         else:
-            found = calibrations_of_messages(reader, self._topics, where)
+            found = calibrations_of_messages(reader, self._topics, where, topics.camera_info)
+        self._info_names = set(found.info_names)
         self._scale = config.depth.scale or found.depth_scale or MILLIMETRES
         self._grey_range = GreyRange(black=config.images.black, white=config.images.white)
         self.info = self._describe(found)

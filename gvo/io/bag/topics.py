@@ -23,12 +23,26 @@ _SIDES = (
     *((f"{name}1", f"{name}2") for name in ("infra", "fisheye")),
 )
 _COLOR = re.compile(r"rgb|colou?r")
-_DEPTH = re.compile(r"depth")
-_REGISTERED = re.compile(r"aligned|registered")
+# Where no name says colour: grey images with depth.
+_GREY = re.compile(r"left|gr[ae]y|mono|infra1")
+# Depth, or colour seen from the depth camera: `rgb_to_depth`.
+_NO_COLOR = re.compile(r"compressedDepth|_to_depth")
+_DEPTH = re.compile(r"(?<!_to_)depth")
+# Where no name says depth: that of an OAK.
+_DEPTH_OR_STEREO = re.compile(rf"{_DEPTH.pattern}|(?<![a-z])stereo/image_raw$")
+# Not to another camera than the colour one: `aligned_depth_to_infra1`.
+_REGISTERED = re.compile(r"(?<!un)(aligned|registered)(?!\w*_to_(?!rgb|colou?r))|_to_(rgb|colou?r)")
+# Of the pixels of the camera as it is, not of the rectified ones.
+_RAW_DEPTH = re.compile(r"depth.*(/image|raw)$")
 # at the start of a word: not in "unrectified" or "direct"
 _RECTIFIED = re.compile(r"(?<![a-z])rect")
-# How the images of one camera differ in name.
-_SORT = re.compile(r"_?(raw|rect(ified)?|colou?r|rgb|mono|gr[ae]y)")
+# How the images of one camera differ in name: not in the middle, as `camera_gray_left`.
+_SORTS = re.compile(
+    r"(?:(?<=/)|_|^)(raw|rect(ified)?)(?=[/_]|$)|(?:(?<=/)|_)(colou?r|mono|gr[ae]y)(?=/|$)"
+)
+_WORD = re.compile(r"[a-z]+|\d+")
+# What the names of all topics of `CameraInfo` hold.
+_OF_INFOS = {"camera", "cam", "info"}
 _NEEDED = "gvo needs a stereo pair, or colour with depth (RGB-D)"
 _N_LISTED = 12
 _Names: TypeAlias = tuple[str | None, str | None]
@@ -56,6 +70,11 @@ class Topic:
         """Whether the name says that the images are rectified."""
         return _RECTIFIED.search(self.base.lower()) is not None
 
+    @property
+    def is_registered(self) -> bool:
+        """Whether the name says that depth is registered to colour."""
+        return _REGISTERED.search(self.base.lower()) is not None
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TopicChoice:
@@ -65,6 +84,7 @@ class TopicChoice:
     right: str | None = None
     color: str | None = None
     depth: str | None = None
+    camera_info: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,9 +113,9 @@ def choose_topics(topics: Sequence[Topic], choice: TopicChoice, where: str) -> C
     """Choose the image topics of one camera.
 
     A stereo pair is two topics that differ in left and right, image_0 and image_1, or the like;
-    an RGB-D camera is one with rgb or colour in its name and one with depth. Of the topics of
-    one camera, rectified ones are taken before raw ones, and these before compressed ones. Where
-    the user chose one topic, its partner is found.
+    an RGB-D camera is one with rgb or colour (else grey) in its name and one with depth. Of the
+    topics of one camera, rectified ones are taken before raw ones, and these before compressed
+    ones; with depth of raw pixels raw ones. Where the user chose one topic, its partner is found.
 
     Raises
     ------
@@ -115,6 +135,8 @@ def choose_topics(topics: Sequence[Topic], choice: TopicChoice, where: str) -> C
         *_best(_fitting(_stereo_pairs(images), chosen) if sensor in (None, "stereo") else []),
         *_best(_fitting(_rgbd_pairs(images), chosen) if sensor in (None, "rgbd") else []),
     ]
+    if not candidates and sensor != "stereo":
+        candidates = _best(_fitting(_rgbd_pairs(images, is_found=False), chosen))
     if len(candidates) == 1:
         return candidates[0]
     for name, topic in zip(("right", "left", "depth", "color"), [*chosen, *chosen], strict=True):
@@ -128,25 +150,28 @@ def choose_topics(topics: Sequence[Topic], choice: TopicChoice, where: str) -> C
     raise RecordingError(_explain(where, images, candidates))
 
 
-def find_camera_info(image: Topic, topics: Iterable[Topic]) -> str | None:
-    """Return the name of the `CameraInfo` topic of an image topic; None where it has no messages.
+def camera_info_topics(image: Topic, infos: Iterable[Topic]) -> list[tuple[Topic, bool]]:
+    """Return the topics of `CameraInfo` that may be of an image topic, best first.
 
-    It is `camera_info` beside the image topic, below it, or beside or below its namespace.
+    First those by their place, beside the image topic, below it, or beside or below its namespace,
+    whose name says nothing that the image's does not: with True. Then those anywhere that do not
+    contradict it, as raw ones do rectified images and right ones left images.
     """
-    names = {
-        topic.name.strip("/"): topic.name
-        for topic in topics
-        if topic.type == CAMERA_INFO_TYPE and topic.n_messages > 0
-    }
-    return next((names[base] for base in camera_info_names(image) if base in names), None)
-
-
-def camera_info_names(image: Topic) -> list[str]:
-    """Return where `CameraInfo` is looked for: names without the leading slash, best first."""
     parent = image.base.rpartition("/")[0]
     grandparent = parent.rpartition("/")[0]
-    places = [parent, image.base, grandparent, f"{grandparent}/info"]
-    return [f"{place}/camera_info".strip("/") for place in places]
+    places = [parent, image.base, grandparent, f"{grandparent}/info".strip("/")]
+    words = {*_WORD.findall(image.base.lower())}
+    against = {"left", "right", "rect", "rectified", "raw" if image.is_rectified else "rect"}
+    found: list[tuple[int, int, int, Topic]] = []
+    for topic in infos:
+        said = {*_WORD.findall(topic.base.lower())} - _OF_INFOS
+        place = topic.base.rpartition("/")[0]
+        is_near = place in places and said <= words
+        if is_near or not (said - words) & against:
+            rank = places.index(place) if is_near else len(places)
+            found.append((rank, -_n_common_parts(image, topic), -len(said & words), topic))
+    found.sort(key=lambda each: each[:3])
+    return [(topic, rank < len(places)) for rank, *_, topic in found]
 
 
 def find_topic(name: str, topics: Iterable[Topic]) -> Topic | None:
@@ -203,15 +228,21 @@ def _other_side(name: str, side: str, other: str) -> Iterator[str]:
         yield name[: match.start()] + other + name[match.end() :]
 
 
-def _rgbd_pairs(images: Sequence[Topic]) -> Iterator[CameraTopics]:
-    usable = [topic for topic in images if topic.n_messages > 0]
-    depths = [topic for topic in usable if _DEPTH.search(topic.base.lower())]
-    for color in usable:
-        name = color.base.lower()
-        if color in depths or not _COLOR.search(name) or color.name.endswith("compressedDepth"):
-            continue
+def _rgbd_pairs(images: Sequence[Topic], *, is_found: bool = True) -> Iterator[CameraTopics]:
+    """Yield colour with depth; where no camera is found otherwise, names that say less count."""
+    usable = {topic.name.lower(): topic for topic in images if topic.n_messages > 0}
+    words = _DEPTH if is_found else _DEPTH_OR_STEREO
+    depths = [topic for topic in usable.values() if words.search(topic.base.lower())]
+    others = [t for t in usable.values() if t not in depths and not _NO_COLOR.search(t.name)]
+    colors = [topic for topic in others if _COLOR.search(topic.base.lower())]
+    if not (colors or is_found):
+        colors = [topic for topic in others if _GREY.search(topic.base.lower())]
+    for color in colors:
+        # the depth of a stereo camera is that of its left one
+        is_right = any(name in usable for name in _other_side(color.name.lower(), "right", "left"))
         for depth in depths:
-            yield CameraTopics(sensor="rgbd", first=color, second=depth)
+            if not is_right or "right" in depth.name.lower():
+                yield CameraTopics(sensor="rgbd", first=color, second=depth)
 
 
 def _best(pairs: Iterable[CameraTopics]) -> list[CameraTopics]:
@@ -225,11 +256,14 @@ def _best(pairs: Iterable[CameraTopics]) -> list[CameraTopics]:
 
 
 def _camera_name(pair: CameraTopics) -> str:
-    if pair.sensor == "stereo":
-        return pair.first.base.rpartition("/")[0]
-    parts = pair.first.base.lower().split("/")
-    index = next(i for i, part in enumerate(parts) if _COLOR.search(part))
-    return "/".join(parts[:index])
+    """Return the place of a pair's first topic, without how images of one camera differ."""
+    place = _SORTS.sub("", pair.first.base.lower().rpartition("/")[0])
+    parts = [part for part in place.split("/") if part]
+    if pair.sensor == "rgbd":
+        parts = parts[: next((i for i, part in enumerate(parts) if _COLOR.search(part)), None)]
+        if "left" not in pair.second.base.lower():
+            parts = [part for part in parts if part != "left"]
+    return "/".join(parts)
 
 
 def _score(pair: CameraTopics) -> _Score:
@@ -241,13 +275,14 @@ def _score(pair: CameraTopics) -> _Score:
     )
     if pair.sensor == "stereo":
         return score
-    is_registered = bool(_REGISTERED.search(pair.second.base.lower()))
-    is_consistent = pair.first.is_rectified == pair.second.is_rectified
-    return _n_common_parts(pair), is_registered, is_consistent, *score
+    says_state = pair.second.is_rectified or _RAW_DEPTH.search(pair.second.base.lower())
+    is_consistent = not says_state or pair.first.is_rectified == pair.second.is_rectified
+    n_common = _n_common_parts(pair.first, pair.second)
+    return n_common, pair.second.is_registered, is_consistent, *score
 
 
-def _n_common_parts(pair: CameraTopics) -> int:
-    parts = zip(pair.first.base.split("/"), pair.second.base.split("/"), strict=False)
+def _n_common_parts(first: Topic, second: Topic) -> int:
+    parts = zip(first.base.split("/"), second.base.split("/"), strict=False)
     return next((n for n, (a, b) in enumerate(parts) if a != b), 0)
 
 
@@ -256,7 +291,7 @@ def _explain(where: str, images: Sequence[Topic], candidates: Sequence[CameraTop
         choices = " or ".join(candidate.flags for candidate in candidates)
         return f"{where}: holds more than one camera; choose {choices}"
     held = describe_topics(images)
-    if len({_SORT.sub("", topic.base.lower()) for topic in images}) == 1:
+    if len({_SORTS.sub("", topic.base.lower()) for topic in images}) == 1:
         return f"{where}: holds one camera alone, {held}; {_NEEDED}"
     return (
         f"{where}: {_NEEDED}, and none is known by the names of the image topics {held}; choose "

@@ -17,6 +17,7 @@ from gvo.errors import ConfigurationError, OutputError, TrajectoryError, write_f
 from gvo.geometry.edges import inverse
 from gvo.io.edges.events import EdgeEvent, Event, InputFaults, PoseEvent, anchor
 from gvo.io.edges.pose_streams import StepSigma
+from gvo.io.poses.tf import list_names
 from gvo.io.run_folder.line_file import replace_text
 from gvo.trajectory import g2o
 from gvo.types import Edge, FloatArray, FrameId
@@ -26,7 +27,6 @@ _TAG = re.compile(r"[A-Z][A-Z0-9_]*(:[A-Z0-9_]+)*$")
 GRAPH = "smoothed.g2o"
 # Lines that are parsed together.
 _BLOCK = 512
-_N_LISTED = 12
 
 
 class PoseGraphSource:
@@ -74,11 +74,8 @@ class PoseGraphSource:
         self._repeated: set[int] = set()
         self._read(path)
         if self._repeated:
-            ids = ", ".join(map(str, sorted(self._repeated)[:_N_LISTED]))
-            raise TrajectoryError(
-                f"{path}: {len(self._repeated)} ids are given to more than one vertex: {ids}"
-                f"{', ...' * (len(self._repeated) > _N_LISTED)}; give each pose its own"
-            )
+            ids = list_names([str(each) for each in sorted(self._repeated)])
+            raise TrajectoryError(f"{path}: ids are given to more than one vertex: {ids}")
         self.n_poses = len(self.vertices)
         if not self._edges:
             known = f"expected lines of {' or '.join(g2o.MEASUREMENT_TAGS)}"

@@ -429,12 +429,11 @@ def describe_parents(
     parents: dict[str, list[str]] = {}
     for parent, child in sorted(edges):
         parents.setdefault(child, []).append(parent)
-    found = {
-        child: names
+    said = [
+        f"{child} has the parents {' and '.join(names)}"
         for child, names in parents.items()
         if len(names) > 1 and (children is None or child in children)
-    }
-    said = [f"{child} has the parents {' and '.join(names)}" for child, names in found.items()]
+    ]
     return f"{list_names(said)}: publish one of them, a frame has one parent" if said else ""
 
 

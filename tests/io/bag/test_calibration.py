@@ -27,7 +27,7 @@ def _image(topic: str, size: tuple[int, int] = (48, 32), frame_id: str = "camera
     return image(topic, np.zeros(size[::-1], np.uint8), header=header(frame_id))
 
 
-def _found(path: Path, messages: Sequence[Message], **choice: str) -> BagCalibration:
+def _found(path: Path, messages: Sequence[Message], **choice: Any) -> BagCalibration:
     reader = BagReader(write(path, messages))
     topics = choose_topics(reader.topics, TopicChoice(**choice), "the bag")
     return calibrations_of_messages(reader, topics, "the bag")
@@ -178,8 +178,10 @@ def test_depth_of_another_camera_comes_with_its_calibration_and_place(tmp_path: 
         ("/c/depth/image_raw", {"frame_id": "color_optical"}),
         ("/c/depth/image_raw", {"frame_id": "/color_optical"}),
         ("/c/depth/image_raw", {"frame_id": "coincident"}),
-        ("/c/aligned_depth_to_color/image_raw", {"K": _DEPTH_K}),
-        ("/c/depth_registered/image_raw", {"K": _DEPTH_K}),
+        # a driver that leaves the frame of the depth camera
+        ("/c/aligned_depth_to_color/image_raw", {}),
+        ("/c/depth_registered/image_raw", {}),
+        ("/c/depth_to_rgb/image_raw", {}),
     ],
 )
 def test_registered_depth_is_left_alone(tmp_path: Path, name: str, depth: dict[str, Any]) -> None:
@@ -190,3 +192,148 @@ def test_registered_depth_is_left_alone(tmp_path: Path, name: str, depth: dict[s
     found = _found(tmp_path / "a.bag", [*_rgbd(name, **depth), *mounts])
     assert found.depth_view is None
     assert not any(line.startswith("depth: ") for line in found.decisions)
+
+
+_HALF = {"width": 24, "height": 16, "K": [25.0, 0, 11.5, 0, 25.0, 7.5, 0, 0, 1]}
+
+
+@pytest.mark.parametrize(
+    ("name", "depth", "place"),
+    [
+        ("/c/depth_registered/image_raw", {"K": _DEPTH_K}, _T_COLOR_DEPTH),
+        ("/c/aligned_depth_to_color/image_raw", {"K": _DEPTH_K}, _T_COLOR_DEPTH),
+        ("/c/aligned_depth_to_infra1/image_raw", {}, _T_COLOR_DEPTH),
+        ("/c/depth/image_raw", {}, _T_COLOR_DEPTH),
+        ("/c/depth/image_raw", _HALF, _T_COLOR_DEPTH),
+        ("/c/depth_registered/image_raw", _HALF, np.eye(4)),
+        ("/c/depth_registered/image_raw", {"frame_id": "color_optical", **_HALF}, np.eye(4)),
+        ("/c/depth/image_raw", {"frame_id": "color_optical", **_HALF}, np.eye(4)),
+        ("/c/depth/depth_registered", {"frame_id": "color_optical", "K": _DEPTH_K}, np.eye(4)),
+    ],
+)
+def test_depth_is_registered_by_frame_and_intrinsics_not_by_a_word(
+    tmp_path: Path, name: str, depth: dict[str, Any], place: FloatArray
+) -> None:
+    mount = tf("/tf_static", "color_optical", "depth_optical", _T_COLOR_DEPTH)
+    view = _found(tmp_path / "a.bag", [*_rgbd(name, **depth), mount]).depth_view
+    assert view is not None
+    np.testing.assert_allclose(view.T_color_depth, place, atol=1e-9)
+    assert view.calibration.width == depth.get("width", 48)
+
+
+@pytest.mark.parametrize(("fx", "is_registered"), [(50.0, True), (49.6, False)])
+def test_depth_of_the_rectified_image_is_not_that_of_a_raw_one(
+    tmp_path: Path, fx: float, is_registered: bool
+) -> None:
+    """As a ZED's: one frame, one size, a lens of colour alone, and nearly its focal length."""
+    messages = _rgbd("/c/depth/depth_registered", K=[fx, 0, 23.5, 0, fx, 15.5, 0, 0, 1])
+    infos = [camera_info("/c/rgb/camera_info", "depth_optical", D=_D), messages[3]]
+    found = _found(tmp_path / "a.bag", [*messages[:2], *infos])
+    assert (found.depth_view is None) == is_registered
+
+
+_SEEN = ("eye", (48, 32))
+
+
+@pytest.mark.parametrize(
+    ("image_name", "infos", "expected"),
+    [
+        ("/left/image_rect", {"/left/camera_info": _SEEN}, "/left/camera_info"),
+        ("left/image_rect", {"left/camera_info": _SEEN}, "left/camera_info"),
+        ("/cam0", {"/cam0/camera_info": _SEEN}, "/cam0/camera_info"),
+        ("/cam0/image/data", {"/cam0/camera_info": _SEEN}, "/cam0/camera_info"),
+        ("/C_0/image/data", {"/C_0/info/camera_info": _SEEN}, "/C_0/info/camera_info"),
+        ("/image", {"/camera_info": _SEEN}, "/camera_info"),
+        # a driver that calls one camera by two frames
+        ("/left/image_rect", {"/left/camera_info": ("other", (48, 32))}, "/left/camera_info"),
+        ("/left/image_rect", {"/left/camera_info": ("", (0, 0))}, "/left/camera_info"),
+        # raw and rectified
+        (
+            "/zed/rgb/image_raw_color",
+            {"/zed/rgb/camera_info": _SEEN, "/zed/rgb/camera_info_raw": _SEEN},
+            "/zed/rgb/camera_info_raw",
+        ),
+        (
+            "/zed/rgb/image_rect_color",
+            {"/zed/rgb/camera_info_raw": _SEEN, "/zed/rgb/camera_info": _SEEN},
+            "/zed/rgb/camera_info",
+        ),
+        ("/zed/rgb/image_rect_color", {"/zed/rgb/camera_info_raw": _SEEN}, None),
+        (
+            "/left/color/rect/image",
+            {"/left/color/raw/camera_info": _SEEN, "/left/color/rect/camera_info": _SEEN},
+            "/left/color/rect/camera_info",
+        ),
+        ("/left/color/rect/image", {"/left/color/raw/camera_info": _SEEN}, None),
+        (
+            "/rgb/image_rect_color",
+            {"/rgb/image_rect_color/camera_info": _SEEN},
+            "/rgb/image_rect_color/camera_info",
+        ),
+        ("/infra1/image_rect_raw", {"/infra1/camera_info": _SEEN}, "/infra1/camera_info"),
+        # numbers and sides
+        (
+            "/cam/image_0",
+            {"/cam/camera_info_1": _SEEN, "/cam/camera_info_0": _SEEN},
+            "/cam/camera_info_0",
+        ),
+        (
+            "/cam/image_1",
+            {"/cam/camera_info_0": _SEEN, "/cam/camera_info_1": _SEEN},
+            "/cam/camera_info_1",
+        ),
+        (
+            "/s/left_image",
+            {"/s/right_camera_info": _SEEN, "/s/left_camera_info": _SEEN},
+            "/s/left_camera_info",
+        ),
+        ("/s/left/image", {"/s/right/camera_info": _SEEN}, None),
+        ("/s/left/image", {"/infos/right": _SEEN, "/infos/left": _SEEN}, "/infos/left"),
+        # elsewhere, with the size and the frame of the images
+        ("/cam/image_raw", {"/cam/camera_info_0": _SEEN}, "/cam/camera_info_0"),
+        ("/cam/image_raw", {"/cam/camera_info_0": ("other", (48, 32))}, None),
+        ("/cam/image_raw", {"/cam/camera_info_0": ("eye", (96, 64))}, None),
+        (
+            "/cam/image_raw",
+            {"/cam/camera_info": ("eye", (96, 64)), "/cam/half/camera_info": _SEEN},
+            "/cam/half/camera_info",
+        ),
+        (
+            "/cam/image_raw",
+            {"/cam/camera_info": ("other", (48, 32)), "/driver/camera_info": _SEEN},
+            "/driver/camera_info",
+        ),
+        ("/cam/image_raw", {"/cam/camera_info": ("eye", (96, 64))}, "/cam/camera_info"),
+    ],
+)
+def test_a_camera_info_is_that_of_the_image_s_name_size_and_frame(
+    tmp_path: Path,
+    image_name: str,
+    infos: dict[str, tuple[str, tuple[int, int]]],
+    expected: str | None,
+) -> None:
+    messages = [_image(image_name, frame_id="eye"), _image("/other")]
+    for name, (frame_id, (width, height)) in infos.items():
+        messages.append(camera_info(name, frame_id, width=width, height=height))
+    choice = {"color": image_name, "depth": "/other"}
+    if expected is None:
+        with pytest.raises(
+            CalibrationError, match=f"no CameraInfo for {image_name}, it holds /.*-i"
+        ):
+            _found(tmp_path / "a.bag", messages, **choice)
+        return
+    assert _found(tmp_path / "a.bag", messages, **choice).info_names[0] == expected
+
+
+def test_camera_info_is_what_the_user_names_in_the_order_of_the_images(tmp_path: Path) -> None:
+    P_right = [*_P[:3], -25.0, *_P[4:]]
+    infos = [camera_info("/s/a", P=_P), camera_info("/s/b", P=P_right), *_pair("image_rect", P=_P)]
+    reader = BagReader(write(tmp_path / "a.bag", infos))
+    topics = choose_topics(reader.topics, TopicChoice(), "the bag")
+    found = calibrations_of_messages(reader, topics, "the bag", ["/s/a", "s/b"])
+    assert found.info_names == ("/s/a", "/s/b")
+    assert found.calibrations[1].P[0, 3] == -25.0
+    with pytest.raises(
+        CalibrationError, match=r"right/image_rect on /s/c, it holds .*--camera-info"
+    ):
+        calibrations_of_messages(reader, topics, "the bag", ["/s/a", "/s/c"])

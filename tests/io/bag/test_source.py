@@ -14,7 +14,7 @@ from gvo.errors import CalibrationError, RecordingError
 from gvo.io.bag.cameras import find_contradiction
 from gvo.io.bag.recovery.scan import Channel
 from gvo.io.bag.source import BagSource, describe_camera_changes
-from gvo.io.bag.topics import IMAGE_TYPE
+from gvo.io.bag.topics import IMAGE_TYPE, TopicChoice
 from gvo.io.frames import frames
 from gvo.types import FaultyFrame, RgbdFrame, StereoFrame
 from tests.make.bags import Message, camera_info, image, write
@@ -107,7 +107,7 @@ def test_an_image_recorded_at_no_time_is_a_faulty_frame(
 def test_a_calibration_file_replaces_camera_info(tmp_path: Path, tiny: Any) -> None:
     messages = [m for m in _rgbd(tiny, tiny.counts(1), "16UC1") if m[1] == IMAGE_TYPE]
     bag = write(tmp_path / "a.bag", messages)
-    with pytest.raises(CalibrationError, match=r"no CameraInfo for /c/rgb/image_color: .*--calib"):
+    with pytest.raises(CalibrationError, match=r"/c/rgb/image_color, it holds none; give --calib"):
         BagSource(bag)
     path = tmp_path / "mine.yaml"
     path.write_text(yaml.safe_dump(tiny.ros_camera(depth_scale=2500)))
@@ -131,6 +131,15 @@ def test_bags_of_two_cameras_are_not_one_recording(tmp_path: Path, tiny: Any) ->
         BagSource(paths)
     other[0] = (*other[0][:3], messages[0][3])
     assert BagSource([paths[0], write(tmp_path / "c.bag", other)]).info.n_images == 6
+
+
+def test_camera_info_is_chosen_or_replaced(tmp_path: Path, tiny: Any) -> None:
+    bag = write(tmp_path / "a.bag", [*_stereo(tiny), _info("/other", _P_RIGHT)])
+    source = BagSource(bag, topics=TopicChoice(camera_info=("/s/left/camera_info", "/other")))
+    assert "calibration: /s/left/camera_info + /other" in source.info.decisions[1]
+    for names, calibration in ((("/other",) * 3, None), (("/other",), tmp_path / "mine.yaml")):
+        with pytest.raises(RecordingError, match="at most two --camera-info, or --calibration"):
+            BagSource(bag, topics=TopicChoice(camera_info=names), calibration=calibration)
 
 
 @pytest.mark.parametrize(("gap_s", "is_one"), [(-2, False), (0, True), (4, True), (6, False)])

@@ -1,6 +1,8 @@
 """Which topics hold the camera."""
 
+import re
 from itertools import permutations
+from typing import Any
 
 import pytest
 
@@ -12,7 +14,6 @@ from gvo.io.bag.topics import (
     Topic,
     TopicChoice,
     choose_topics,
-    find_camera_info,
 )
 
 
@@ -25,7 +26,7 @@ def _topics(*names: str, n_messages: int = 5) -> list[Topic]:
     ]
 
 
-def _choose(topics: list[Topic], **choice: str) -> tuple[str, str, str]:
+def _choose(topics: list[Topic], **choice: Any) -> tuple[str, str, str]:
     camera = choose_topics(topics, TopicChoice(**choice), "a.bag")
     return camera.sensor, camera.first.name, camera.second.name
 
@@ -75,6 +76,176 @@ def test_rectified_topics_are_taken_before_raw_ones_and_these_before_compressed_
     assert taken == ("stereo", "/stereo/left/image_rect", "/stereo/right/image_rect")
     taken = _choose(_topics(*(name for name in names if "rect" not in name)))
     assert taken == ("stereo", "/stereo/left/image_raw", "/stereo/right/image_raw")
+
+
+# camera -> the topics of its driver, colour and depth that belong together, or left and right
+_DRIVERS = {
+    "ZED 5.1": (
+        [
+            f"/zed/zed_node/{eye}/{color}/{state}/image"
+            for eye in ("left", "rgb")
+            for color in ("color", "gray")
+            for state in ("raw", "rect")
+        ]
+        + ["/zed/zed_node/depth/depth_registered"],
+        (
+            "rgbd",
+            "/zed/zed_node/(left|rgb)/(color|gray)/rect/image",
+            "/zed/zed_node/depth/depth_registered",
+        ),
+    ),
+    "ZED 5.1, stereo": (
+        [
+            f"/zed/zed_node/{eye}/{color}/{state}/image/compressed"
+            for eye in ("right", "left")
+            for color in ("color", "gray")
+            for state in ("raw", "rect")
+        ],
+        (
+            "stereo",
+            "/zed/zed_node/left/gray/rect/image/compressed",
+            "/zed/zed_node/right/gray/rect/image/compressed",
+        ),
+    ),
+    "ZED 4": (
+        [
+            "/zed/zed_node/rgb_raw/image_raw_color",
+            "/zed/zed_node/rgb/image_rect_color",
+            "/zed/zed_node/rgb_gray/image_rect_gray",
+            "/zed/zed_node/depth/depth_registered",
+            "/zed/zed_node/left_raw/image_raw_color",
+            "/zed/zed_node/left/image_rect_color",
+        ],
+        (
+            "rgbd",
+            "/zed/zed_node/(left|rgb)(_gray)?/image_rect_.*",
+            "/zed/zed_node/depth/depth_registered",
+        ),
+    ),
+    "ZED 4, stereo": (
+        [
+            f"/zed/zed_node/{eye}{kind}"
+            for eye in ("left", "right")
+            for kind in ("_raw/image_raw_color", "/image_rect_color", "_gray/image_rect_gray")
+        ],
+        (
+            "stereo",
+            "/zed/zed_node/left_gray/image_rect_gray",
+            "/zed/zed_node/right_gray/image_rect_gray",
+        ),
+    ),
+    "ZED 2": (
+        ["/zed/rgb/image_raw_color", "/zed/depth/depth_registered"],
+        ("rgbd", "/zed/rgb/image_raw_color", "/zed/depth/depth_registered"),
+    ),
+    "RealSense": (
+        [
+            "/camera/color/image_raw",
+            "/camera/depth/image_rect_raw",
+            "/camera/aligned_depth_to_infra1/image_raw",
+            "/camera/aligned_depth_to_color/image_raw",
+        ],
+        ("rgbd", "/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw"),
+    ),
+    "RealSense D405": (
+        ["/camera/color/image_rect_raw", "/camera/depth/image_rect_raw"],
+        ("rgbd", "/camera/color/image_rect_raw", "/camera/depth/image_rect_raw"),
+    ),
+    "RealSense, stereo": (
+        [
+            "/camera/infra1/image_rect_raw",
+            "/camera/infra2/image_rect_raw",
+            "/camera/depth/image_rect_raw",
+        ],
+        ("stereo", "/camera/infra1/image_rect_raw", "/camera/infra2/image_rect_raw"),
+    ),
+    "RealSense, one eye": (
+        ["/camera/infra1/image_rect_raw", "/camera/depth/image_rect_raw"],
+        ("rgbd", "/camera/infra1/image_rect_raw", "/camera/depth/image_rect_raw"),
+    ),
+    "Azure Kinect": (
+        [
+            "/rgb/image_raw",
+            "/depth/image_raw",
+            "/depth_to_rgb/image_raw",
+            "/ir/image_raw",
+            "/rgb_to_depth/image_raw",
+        ],
+        ("rgbd", "/rgb/image_raw", "/depth_to_rgb/image_raw"),
+    ),
+    "OAK-D": (
+        ["/oak/rgb/image_raw", "/oak/stereo/image_raw"],
+        ("rgbd", "/oak/rgb/image_raw", "/oak/stereo/image_raw"),
+    ),
+    "OAK-D, rectified": (
+        ["/oak/rgb/image_raw", "/oak/rgb/image_rect", "/oak/stereo/image_raw"],
+        ("rgbd", "/oak/rgb/image_rect", "/oak/stereo/image_raw"),
+    ),
+    "OAK-D, stereo": (
+        [
+            "/oak/left/image_rect",
+            "/oak/right/image_rect",
+            "/oak/rgb/image_raw",
+            "/oak/stereo/image_raw",
+        ],
+        ("stereo", "/oak/left/image_rect", "/oak/right/image_rect"),
+    ),
+    "Orbbec": (
+        ["/camera/color/image_raw", "/camera/depth/image_raw", "/camera/ir/image_raw"],
+        ("rgbd", "/camera/color/image_raw", "/camera/depth/image_raw"),
+    ),
+    "Kinect, openni": (
+        [f"/camera/rgb/image_{kind}" for kind in ("raw", "mono", "color", "rect_color")]
+        + ["/camera/depth/image_raw", "/camera/depth_registered/image_raw"],
+        ("rgbd", "/camera/rgb/image_(raw|mono|color)", "/camera/depth_registered/image_raw"),
+    ),
+    "Kinect, registered by software": (
+        [f"/camera/rgb/image_{kind}" for kind in ("raw", "color", "rect_color")]
+        + ["/camera/depth/image_rect", "/camera/depth_registered/sw_registered/image_rect_raw"],
+        (
+            "rgbd",
+            "/camera/rgb/image_rect_color",
+            "/camera/depth_registered/sw_registered/image_rect_raw",
+        ),
+    ),
+    "Kinect 2": (
+        [f"/kinect2/qhd/image_{kind}" for kind in ("color", "color_rect", "depth_rect")],
+        ("rgbd", "/kinect2/qhd/image_color_rect", "/kinect2/qhd/image_depth_rect"),
+    ),
+    "Xtion": (
+        ["/xtion/rgb/image_raw", "/xtion/depth_registered/image_raw", "/xtion/depth/image_raw"],
+        ("rgbd", "/xtion/rgb/image_raw", "/xtion/depth_registered/image_raw"),
+    ),
+    "MYNT EYE": (
+        [
+            "/mynteye/left/image_raw",
+            "/mynteye/left_rect/image_rect",
+            "/mynteye/depth/image_raw",
+            "/mynteye/right_rect/image_rect",
+            "/mynteye/right/image_raw",
+        ],
+        ("stereo", "/mynteye/left_rect/image_rect", "/mynteye/right_rect/image_rect"),
+    ),
+    "Basler": (
+        [
+            "/basler/left/image_raw",
+            "/basler/right/image_raw",
+            "/basler/left/image_rect",
+            "/basler/right/image_rect",
+        ],
+        ("stereo", "/basler/left/image_rect", "/basler/right/image_rect"),
+    ),
+}
+
+
+@pytest.mark.parametrize("driver", _DRIVERS)
+def test_the_topics_of_a_driver_are_known(driver: str) -> None:
+    names, (sensor, first, second) = _DRIVERS[driver]
+    for ordered in (names, names[::-1], sorted(names)):
+        found = _choose(_topics(*ordered))
+        assert found[0] == sensor
+        assert re.fullmatch(first, found[1])
+        assert found[2] == second
 
 
 @pytest.mark.parametrize("own", ["/camera/depth/image_rect_raw", "/camera/depth/image_raw"])
@@ -128,21 +299,3 @@ def test_no_camera_is_refused_with_what_there_is() -> None:
 )
 def test_the_name_says_whether_images_are_rectified(name: str, is_rectified: bool) -> None:
     assert _topics(name)[0].is_rectified is is_rectified
-
-
-@pytest.mark.parametrize(
-    ("image", "info"),
-    [
-        ("/left/image_rect", "/left/camera_info"),
-        ("left/image_rect", "left/camera_info"),
-        ("/left/image_raw/compressed", "/left/camera_info"),
-        ("/cam0", "/cam0/camera_info"),
-        ("/cam0/image/data", "/cam0/camera_info"),
-        ("/Color_0/image/data", "/Color_0/info/camera_info"),
-        ("/image", "/camera_info"),
-    ],
-)
-def test_camera_info_is_found_in_the_namespace(image: str, info: str) -> None:
-    topics = _topics("/elsewhere/camera_info", image, info)
-    assert find_camera_info(topics[1], topics) == info
-    assert find_camera_info(topics[1], topics[:2]) is None
