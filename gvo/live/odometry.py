@@ -230,8 +230,10 @@ class LiveOdometry:
             is_robot=not base_frame.is_camera and not base_frame.origin,
         )
         self._loop, self._save = loop, save
-        loop.take_waited_s = self._waiting.take_waited_s
+        waiting = self._waiting
+        loop.waited_s = lambda: waiting.waited_s
         if self.viewer is not None:
+            self.viewer.waited_s = loop.waited_s
             self.viewer.begin(loop.window)
             loop.on_tracked = self.viewer.add
         self._messages = LiveMessages(self._writers, frames, self.arrivals.note_sent, self._say)
@@ -403,6 +405,8 @@ class WaitingPairs:
     Attributes
     ----------
     n_dropped : int
+    waited_s : float
+        How long `take` has waited, seconds.
     on_pair : callable
         Called with the stamp of each pair that is put.
     """
@@ -421,7 +425,7 @@ class WaitingPairs:
         self._fault: GvoError | None = None
         self._changed = threading.Condition()
         self._actions: deque[Callable[[], object]] = deque()
-        self._waited_s = 0.0
+        self.waited_s = 0.0
         self.n_dropped = 0
         self.on_pair: Callable[[int], None] = lambda _: None
 
@@ -481,16 +485,11 @@ class WaitingPairs:
             start_s = time.perf_counter()
             with self._changed:
                 self._changed.wait_for(lambda: self._actions or self._items or self._is_closed)
-                self._waited_s += time.perf_counter() - start_s
+                self.waited_s += time.perf_counter() - start_s
                 if not self._actions:
                     return self._take()
                 action = self._actions.popleft()
             action()
-
-    def take_waited_s(self) -> float:
-        """Return how long `take` has waited since this was last called, seconds."""
-        waited_s, self._waited_s = self._waited_s, 0.0
-        return waited_s
 
     def _take(self) -> Paired | None:
         if not self._items:

@@ -73,8 +73,8 @@ class RunLoop:
         stamp of a frame, and the edge to it from a frame about 1 s earlier.
     output_faults : list of str
         Why outputs could not be written completely.
-    take_waited_s : callable
-        Returns how long reading waited for the last frame of a running camera, seconds.
+    waited_s : callable
+        Returns how long reading has waited for frames of a running camera so far, seconds.
     on_tracked : callable or None
         Called after the outputs with each frame and its result (poses of the camera), or with a
         faulty frame and None.
@@ -100,7 +100,7 @@ class RunLoop:
         self._outputs: list[Output] = []
         self.edges: list[tuple[int, Edge]] = []
         self.output_faults: list[str] = []
-        self.take_waited_s: Callable[[], float] = lambda: 0.0
+        self.waited_s: Callable[[], float] = lambda: 0.0
         self.on_tracked: Callable[[Frame | FaultyFrame, FrameResult | None], None] | None = None
         self._asked_ns: int | None = None
         self._odometry = Odometry(source.info.camera, config)
@@ -214,7 +214,7 @@ class RunLoop:
         items = frames(self.source, self.config, self.excerpt, through=self._through)
         iterator = iter(items)
         while True:
-            start = time.perf_counter()
+            start, waited_s = time.perf_counter(), self.waited_s()
             try:
                 item = next(iterator)
             except StopIteration:
@@ -222,7 +222,8 @@ class RunLoop:
             except RecordingError as error:
                 self.statistics.broken_off = str(error)
                 return
-            self._read_ms = 1e3 * (time.perf_counter() - start - self.take_waited_s())
+            waited_s = self.waited_s() - waited_s
+            self._read_ms = 1e3 * (time.perf_counter() - start - waited_s)
             yield item
 
     def _take(self, item: Frame | FaultyFrame) -> None:

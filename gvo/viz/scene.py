@@ -95,14 +95,21 @@ class Track:
 
     def lines(self, loops: Iterable[Loop]) -> FloatArray:
         """Return lines (n, 2, 3) from frame to reference of those loops that count, metres."""
-        counting = [loop for loop in loops if not loop.reason]
-        ends = [(self.at(loop.stamp_ns), self.at(loop.reference_ns)) for loop in counting]
-        known = [
-            [T[:3, 3], T_reference[:3, 3]]
-            for T, T_reference in ends
-            if T is not None and T_reference is not None
+        ends = [
+            [self._position(loop.stamp_ns), self._position(loop.reference_ns)]
+            for loop in loops
+            if not loop.reason
         ]
-        return np.array(known).reshape(-1, 2, 3)
+        return np.array([each for each in ends if None not in each]).reshape(-1, 2, 3)
+
+    def _position(self, stamp_ns: int) -> array[float] | None:
+        index = bisect_left(self._stamps_ns, stamp_ns)
+        is_there = stamp_ns in self._stamps_ns[index : index + 1]
+        return self._poses[_N_NUMBERS * index : _N_NUMBERS * index + 3] if is_there else None
+
+    def forget(self, n: int) -> None:
+        """Forget the n oldest poses."""
+        del self._stamps_ns[:n], self._poses[: _N_NUMBERS * n]
 
 
 class History:
@@ -155,6 +162,13 @@ class History:
         """Take smoothed or global poses, in any order."""
         for estimate in estimates:
             self.tracks[name].add(estimate)
+
+    def forget(self, n_most: int, n_loops: int) -> None:
+        """Forget the older half of the poses where there are too many, and older loops."""
+        del self.loops[:-n_loops]
+        for track in self.tracks.values():
+            if len(track) > n_most:
+                track.forget(n_most // 2)
 
     def correct(self, estimates: Iterable[Estimate]) -> None:
         """Take the newest poses of the window: better ones than those known, but not final."""

@@ -60,5 +60,5 @@ def accumulate(clouds: Sequence[tuple[FloatArray, Cloud]]) -> Cloud:
 
 
 def halve(cloud: Cloud) -> Cloud:
-    """Return every second point."""
-    return cloud[0][::2], cloud[1][::2]
+    """Return every second point; of a single one none."""
+    return cloud[0][1::2], cloud[1][1::2]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
@@ -10,6 +11,11 @@ from gvo.config import Config, values_by_name
 from gvo.io.recording import Source
 from gvo.types import FaultyFrame, Frame, FrameResult
 from gvo.viz.view.newest import Newest
+
+# Of the time that tracking leaves, the page draws so much; of all time at least so much, and it
+# rests no longer than would look dead.
+_SHARE, _LEAST_SHARE = 0.5, 0.02
+_LONGEST_REST_S = 3.0
 
 
 class Adjustable(Protocol):
@@ -46,6 +52,8 @@ class LivePlayer:
         Whether the page shows the frames that come.
     is_watched : callable
         Whether anybody looks at the page.
+    waited_s : callable
+        How long tracking has waited for frames so far, seconds.
     """
 
     fault = ""
@@ -55,6 +63,8 @@ class LivePlayer:
         self.source, self.parameters = source, parameters
         self.newest = Newest(source.info.camera)
         self.is_watched: Callable[[], bool] = lambda: True
+        self.waited_s: Callable[[], float] = time.monotonic
+        self._asked_s = self._had_waited_s = 0.0
         self.is_playing = True
         self._window: SlidingWindow | None = None
 
@@ -67,6 +77,17 @@ class LivePlayer:
         """Note a frame, and what it gave: poses of the camera; None of a faulty frame."""
         is_shown = self.is_playing and self.is_watched()
         self.newest.add(frame, result, self._window if is_shown else None, self.config.depth)
+
+    def rest_s(self, spent_s: float) -> float:
+        """Return how long the page shall rest after drawing for `spent_s`.
+
+        It takes half of the time that tracking has waited for frames since the last call.
+        """
+        now_s, waited_s = time.monotonic(), self.waited_s()
+        elapsed_s, idle_s = now_s - self._asked_s, waited_s - self._had_waited_s
+        self._asked_s, self._had_waited_s = now_s, waited_s
+        share = min(max(_SHARE * idle_s / elapsed_s, _LEAST_SHARE), _SHARE)
+        return min(spent_s / share - spent_s, _LONGEST_REST_S)
 
     @property
     def n_frames(self) -> int:

@@ -18,12 +18,12 @@ from gvo.geometry.camera import PinholeCamera
 from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, ImageArray
 from gvo.viz.overlay import compose_faulty, compose_overlay
 from gvo.viz.scene import History, Path, Scene, matched_points, scene
-from gvo.viz.view.clouds import NO_CLOUD, Cloud, accumulate, frame_cloud, halve
+from gvo.viz.view.clouds import MAX_POINTS, NO_CLOUD, Cloud, accumulate, frame_cloud, halve
 
 # Newest poses of the window that are drawn; the window may hold all.
 _N_POSES = 24
 _N_SHOWN_POSES = 1000  # of a path, at most
-_MAX_KEPT_POINTS = 1_000_000  # of all keyframes together
+_MAX_KEPT_POSES, _MAX_KEPT_LOOPS = 300_000, 1000  # some hours
 _MAX_WIDTH_PX = 480
 
 
@@ -91,6 +91,8 @@ class Newest:
     history : History
     n_changes : int
         Counts what is to be shown anew.
+    is_due : bool
+        The page will draw the next frame: it comes with the poses of the window, which cost time.
     """
 
     def __init__(self, camera: PinholeCamera, first_index: int = 0) -> None:
@@ -98,6 +100,7 @@ class Newest:
         self.first_index = self.n_done = first_index
         self.history = History()
         self.n_changes = 0
+        self.is_due = True
         self._clouds: dict[int, Cloud] = {}
         self._stamps_ns: deque[int] = deque(maxlen=_N_POSES)
         self._T_world_frame = np.eye(4)
@@ -122,8 +125,9 @@ class Newest:
             if result is not None and not isinstance(frame, FaultyFrame):
                 self._add_result(frame, result, depth)
             if window is not None:
-                known = [*sorted({*self.history.keyframes, *self._stamps_ns})]
-                self.history.correct(window.estimate(ns) for ns in known if ns in window)
+                if self.is_due:
+                    known = sorted({*self.history.keyframes, *self._stamps_ns})
+                    self.history.correct(window.estimate(ns) for ns in known if ns in window)
                 self._shown, self._view = shown, None
                 self.n_changes += 1
 
@@ -136,8 +140,10 @@ class Newest:
         if result.stamp_ns in result.keyframes_ns:
             cloud = frame_cloud(frame, matched_points(result), self._camera, depth)
             self._clouds[result.stamp_ns] = cloud
-            if sum(len(points) for points, _ in self._clouds.values()) > _MAX_KEPT_POINTS:
-                self._clouds = {ns: halve(each) for ns, each in self._clouds.items()}
+            if sum(len(points) for points, _ in self._clouds.values()) > MAX_POINTS:
+                halves = {ns: halve(each) for ns, each in self._clouds.items()}
+                self._clouds = {ns: each for ns, each in halves.items() if len(each[0])}
+        self.history.forget(_MAX_KEPT_POSES, _MAX_KEPT_LOOPS)
 
     def finish(self, estimates: Iterable[Estimate]) -> None:
         """Take the smoothed poses that are known at the end."""

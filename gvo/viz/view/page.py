@@ -225,16 +225,26 @@ class Page(AbstractContextManager["Page"]):
 
     def _work(self) -> None:
         """Draw the newest frame, at a limited rate; those between are left out."""
+        due_s = 0.0
         while not self._is_closed.wait(_PERIOD_S):
-            shown, newest = self._shown(), self._player.newest
-            frame = newest.view()
-            if frame is not None and shown != self._drawn:
-                with self.server.atomic():
-                    self._draw(frame, newest)
-            self._draw_cloud(newest)
+            start_s, newest = time.monotonic(), self._player.newest
+            if newest.is_due:
+                self._draw_newest(newest)
+                end_s = time.monotonic()
+                rest_s = self._player.rest_s(end_s - start_s)
+                newest.is_due, due_s = rest_s == 0.0, end_s + rest_s
+            elif start_s >= due_s:
+                newest.is_due = True  # the next frame comes with the poses of the window
             self._show_state()
             self.controls.tick()
-            self._drawn = shown
+
+    def _draw_newest(self, newest: Newest) -> None:
+        shown = self._shown()
+        if shown != self._drawn and (frame := newest.view()) is not None:
+            with self.server.atomic():
+                self._draw(frame, newest)
+        self._draw_cloud(newest)
+        self._drawn = shown
 
     def _draw(self, frame: FrameView, newest: Newest) -> None:
         if self._placed_for != newest.first_index:

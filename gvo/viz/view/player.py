@@ -76,6 +76,10 @@ class Player(AbstractContextManager["Player"]):
         self._thread = threading.Thread(target=self._work, name="player", daemon=True)
         self._thread.start()
 
+    def rest_s(self, spent_s: float) -> float:
+        """Return 0: the page may draw all the time."""
+        return 0.0
+
     @contextmanager
     def _changing(self) -> Iterator[None]:
         """Change what the thread waits for."""

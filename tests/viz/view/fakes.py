@@ -126,6 +126,9 @@ class FakePlayer:
         result = None if is_faulty else result_of(index, **changes)
         self.newest.add(frame, result, self.window.take(PERIOD_NS * index), DepthConfig())
 
+    def rest_s(self, spent_s: float) -> float:
+        return 0.0
+
     def reconfigure(self, config: Config) -> None:
         self.calls.append(("reconfigure",))
         self.config = config

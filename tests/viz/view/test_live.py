@@ -1,5 +1,6 @@
 """A run that goes on elsewhere, on the page: the newest frame wins, and nothing waits for it."""
 
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -92,6 +93,43 @@ def test_while_it_is_paused_or_nobody_looks_only_poses_are_noted(
     view = shown(player)
     assert view.index == 0
     assert len(view.paths["causal"][0]) == 3
+
+
+def test_the_page_rests_as_tracking_needs_the_time(
+    player: LivePlayer, window: FakeWindow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = waited_s = 0.0
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    player.waited_s = lambda: waited_s
+    rests = []
+    for idle_s in (10.0, 4.0, 0.4, 0.0):
+        now_s, waited_s = now_s + 10.0, waited_s + idle_s
+        rests.append(player.rest_s(0.02))
+    np.testing.assert_allclose(rests, [0.02, 0.08, 0.98, 0.98])
+    now_s += 1.0
+    assert player.rest_s(1.0) == 3.0  # it does not look dead
+    # While it rests the newest frame wins, and nothing is asked of the window.
+    add(player, window, 0)
+    player.newest.is_due, n_asked = False, window.n_asked
+    add(player, window, 1)
+    assert (shown(player).index, window.n_asked) == (1, n_asked)
+
+
+def test_what_a_page_keeps_of_a_long_run_is_bounded(
+    player: LivePlayer, window: FakeWindow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gvo.viz.view.newest.MAX_POINTS", 500)
+    monkeypatch.setattr("gvo.viz.view.newest._MAX_KEPT_POSES", 40)
+    monkeypatch.setattr("gvo.viz.view.newest._MAX_KEPT_LOOPS", 3)
+    for index in range(50):
+        loops = (loop_of(PERIOD_NS * index, 0),)
+        add(player, window, index, keyframes_ns=(PERIOD_NS * index,), loops=loops)
+    points, _ = player.newest.keyframe_cloud()
+    assert 100 < len(points) <= 500
+    history = player.newest.history
+    assert len(history.loops) == 3
+    assert [len(history.tracks[name]) for name in ("raw", "causal", "smoothed")] == [30] * 3
+    assert history.tracks["raw"].path()[0][-1] == 49 * PERIOD_NS
 
 
 def test_loops_go_on_being_drawn_where_poses_are_corrected(
