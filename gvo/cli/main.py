@@ -440,6 +440,7 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
     except GvoError as error:
-        typer.echo(f"gvo: error: {error}", err=True)
+        with flags_named():
+            typer.echo(f"gvo: error: {error}", err=True)
         is_partly = isinstance(error, OutputError) and error.is_partly
         raise SystemExit(exit_code(False) if is_partly else EXIT_UNUSABLE) from None
