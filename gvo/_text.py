@@ -13,6 +13,7 @@ import re
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
@@ -26,6 +27,9 @@ MAX_LINE = 1 << 20
 
 MAX_SHOWN = 80
 """Largest length of a value in a message, characters."""
+
+MAX_WIDTH = 80
+"""Characters of a line of a table, as many as terminals have at least."""
 
 MAX_CHARACTERS = 1 << 18
 """Largest YAML text, characters; a configuration with all comments has a thirtieth."""
@@ -196,19 +200,19 @@ def read_text(path: Path, *, max_bytes: int) -> str:
     return data.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
 
 
+def wrapped(text: str, indent: str = "") -> list[str]:
+    """Return lines of at most `MAX_WIDTH` characters; a longer word is not broken."""
+    options: Any = {"break_long_words": False, "break_on_hyphens": False}
+    return wrap(text, MAX_WIDTH, subsequent_indent=indent, **options)
+
+
 def number_text(value: float | None, form: str = ".4g") -> str:
     """Return a number as text; a dash if it is None or NaN."""
     return "-" if value is None or math.isnan(value) else f"{value:{form}}"
 
 
-def format_table(
-    header: Sequence[str],
-    rows: Sequence[Sequence[str]],
-    *,
-    is_text: bool = False,
-    measured: Sequence[Sequence[str]] | None = None,
-) -> str:
-    """Return a table of text, its columns aligned by blanks, each line with its line end.
+def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table of text: the first column aligned left, others right, a rule below the header.
 
     Parameters
     ----------
@@ -216,10 +220,6 @@ def format_table(
         Of k columns.
     rows : sequence of sequences of str
         Of k cells each.
-    is_text : bool
-        Align all columns left; else the first left, numbers right, and a rule below the header.
-    measured : sequence of sequences of str, optional
-        Rows that determine the widths of the columns; by default all.
 
     Examples
     --------
@@ -230,15 +230,11 @@ def format_table(
     smoothed   0.5
     """
     table = [[visible(cell) for cell in row] for row in (header, *rows)]
-    by = table if measured is None else [header, *measured]
-    widths = [max(map(len, column)) for column in zip(*by, strict=True)]
-    justify = str.ljust if is_text else str.rjust
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     lines = [
-        "  ".join([row[0].ljust(widths[0]), *map(justify, row[1:], widths[1:])]).rstrip()
-        for row in table
+        "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in table
     ]
-    if not is_text:
-        lines.insert(1, "-" * (sum(widths) + 2 * (len(widths) - 1)))
+    lines.insert(1, "-" * len(lines[0]))
     return "\n".join(lines) + "\n"
 
 

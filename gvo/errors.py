@@ -14,10 +14,8 @@ from gvo._text import cut, shortened_words
 _MAX_MESSAGE = 4000  # characters
 
 
-# A flag with its value, if that is a word in capitals; a command in backticks stays as it is.
-_FLAG = re.compile(
-    r"`[^`]*`|(?<![\w/.-])--(?:set ([^\s,;)]+)|(no-)?([a-z][a-z-]*)(?:( )(?=[A-Z]))?)"
-)
+# A flag, perhaps with a value in capitals; a command in backticks stays as it is.
+_FLAG = re.compile(r"`[^`]*`|(?<![\w/.-])--(?:set ([^\s,;)]+)|([a-z][a-z-]*)( (?=[A-Z]))?)")
 
 
 def said(text: str) -> str:
@@ -26,13 +24,10 @@ def said(text: str) -> str:
 
 
 def _in_python(flag: re.Match[str]) -> str:
-    setting, no, name, has_value = flag.groups()
+    setting, name, has_value = flag.groups()
     if name is None:
         return flag[0] if setting is None else f'settings=["{setting}"]'
-    name = name.replace("-", "_")
-    if no or name == "force":
-        return f"{name}={not no}"
-    return f"{name}=" if has_value else name
+    return f"{name.replace('-', '_')}{'=' if has_value else ''}"
 
 
 @contextmanager

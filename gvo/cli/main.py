@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+import time
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -13,7 +14,7 @@ import typer
 from typer import Argument, Option
 from typer.main import get_command
 
-from gvo._text import plain_floats
+from gvo._text import plain_floats, plain_number
 from gvo._version import __version__
 from gvo.cli import options as opt
 from gvo.cli.batch import batch
@@ -29,14 +30,20 @@ from gvo.cli.terminal import (
     report,
     say,
     status,
+    tell_end,
+    tell_error,
     warn,
     work_on_run,
 )
 from gvo.errors import ConfigurationError, GvoError, OutputError, flags_named, named_faults
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from gvo.io.edges.events import EdgeSource
     from gvo.runs.result import RunResult
+    from gvo.trajectory.evaluation import Evaluation
+    from gvo.trajectory.trajectory import Trajectory
 
 app = typer.Typer(
     name="gvo",
@@ -131,13 +138,18 @@ def run(
     """Estimate the trajectory of a recording, with covariances."""
     from gvo.io.poses.base_frame import find_base_frame, parse_initial_pose
     from gvo.io.poses.inputs import read_truth
+    from gvo.io.run_folder.writer import usual_folder
     from gvo.runs.outputs.options import RunOutputs
     from gvo.runs.run import run_recording
 
+    start_s = time.perf_counter()
     pose = None if initial_pose is None else parse_initial_pose(initial_pose)
     outputs = RunOutputs(
         bag=bag, world=world, overlay=overlay, rerun=rerun, report=with_report, plots=plots
     )
+    usual = usual_folder(recordings[0])
+    is_second = out is None and os.path.lexists(usual)
+    earlier = f"; {usual} holds an earlier run" if is_second else ""
     out = opt.new_folder(out, recordings[0], force=force)
     outputs.check(force=force)
     source = opt.open_source(recordings, parameters, options)
@@ -161,7 +173,10 @@ def run(
             on_progress=work.checking(show),
             on_written=work.note_written,
         )
-    report(result, out)
+    n, elapsed_s = result.summary["frames"], time.perf_counter() - start_s
+    notes = f"{n} frames in {elapsed_s:.1f} s, {n / elapsed_s:.1f} frames per second{earlier}"
+    tell_end(result, source, parameters, [out, *outputs.files], notes)
+    raise typer.Exit(exit_code(result.is_complete))
 
 
 @_command("check")
@@ -294,13 +309,21 @@ def compare(
         Argument(help="Pose file, recording with truth, BAG#tf:PARENT:CHILD or BAG#TOPIC."),
     ],
     estimates: Annotated[list[str], Argument(help="Pose files, BAG#tf:... or BAG#TOPIC.")],
-    align: Annotated[_Align, Option(help="How to align estimates with the reference.")] = "se3",
+    align: Annotated[
+        _Align, Option(metavar="HOW", help="Alignment: none, origin, se3, or sim3 with a scale.")
+    ] = "se3",
     segments: Annotated[
         str | None, Option(metavar="L,...", help="Segment lengths in metres, such as 100,200.")
     ] = None,
     segment_step: Annotated[
         int | None, Option(min=1, metavar="N", help="Start a segment at every Nth pose.")
     ] = None,
+    max_difference: Annotated[
+        float | None, Option(min=0.0, metavar="S", help="Associate stamps within so many seconds.")
+    ] = None,
+    offset: Annotated[
+        str, Option(metavar="S", help="Seconds to add to the stamps of estimates, or auto.")
+    ] = "0",
     as_json: _AsJson = False,
     plot: Annotated[Path | None, Option(metavar="FILE", help="Draw a .png, .pdf or .svg.")] = None,
     report_file: Annotated[
@@ -322,6 +345,10 @@ def compare(
     check_suffix(report_file, PAGES)
     truth, trajectories, notes = read_compared(reference, estimates)
     warn(notes)
+    trajectories = {
+        name: _by_clock(truth, each, name, offset, max_difference)
+        for name, each in trajectories.items()
+    }
     lengths = None if segments is None else _parse_lengths(segments)
     evaluations = [
         evaluate(
@@ -333,6 +360,7 @@ def compare(
         typer.echo(json.dumps(evaluations_json(evaluations), allow_nan=False))
     else:
         say(format_evaluations(evaluations), nl=False)
+        _tell_causes(evaluations)
     if plot is not None:
         from gvo.viz.plots import plot_trajectories
 
@@ -402,6 +430,34 @@ def _parse_lengths(text: str) -> list[float]:
     return lengths
 
 
+def _by_clock(
+    truth: Trajectory, estimate: Trajectory, name: str, offset: str, max_difference: float | None
+) -> Trajectory:
+    """Return an estimate by the clock of the truth, as the options say."""
+    from gvo.trajectory.alignment import clock_offset, synchronized
+
+    if offset == "auto":
+        offset_ns = clock_offset(truth, estimate)
+        say(f"{name}: {1e-9 * offset_ns:+.4f} s added to its stamps", err=True)
+    else:
+        try:
+            offset_ns = round(1e9 * float(plain_number(offset)))
+        except (ValueError, OverflowError):
+            expected = "expected seconds, such as 0.05, or auto"
+            raise ConfigurationError(f"--offset {offset}: {expected}") from None
+    max_ns = None if max_difference is None else round(1e9 * max_difference)
+    return synchronized(truth, estimate, offset_ns=offset_ns, max_difference_ns=max_ns)
+
+
+def _tell_causes(evaluations: Sequence[Evaluation]) -> None:
+    from gvo.io.run_folder.verdict import likely_causes
+    from gvo.trajectory.evaluation import evaluations_json
+
+    for row in evaluations_json(evaluations)["estimates"]:
+        for cause in likely_causes(row)[:1]:
+            say(f"{row['name']}: Likely cause: {cause}")
+
+
 for _each in (batch, live, explain, view):
     _command()(_each)
 
@@ -428,11 +484,12 @@ def _open_standard_streams() -> None:
             setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))  # noqa: SIM115
 
 
+@flags_named()
 def main() -> None:
     """Run the command; one line and exit code 2 for bad input."""
     _open_standard_streams()
     try:
-        with flags_named(), ended_by_signals(), named_faults(GvoError, "gvo"):
+        with ended_by_signals(), named_faults(GvoError, "gvo"):
             raise SystemExit(_run() or 0)
     except typer.Abort:
         raise SystemExit(130) from None
@@ -440,7 +497,6 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
     except GvoError as error:
-        with flags_named():
-            typer.echo(f"gvo: error: {error}", err=True)
+        tell_error(error)
         is_partly = isinstance(error, OutputError) and error.is_partly
         raise SystemExit(exit_code(False) if is_partly else EXIT_UNUSABLE) from None

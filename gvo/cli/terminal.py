@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import logging
 import os
+import re
+import shutil
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
+from itertools import islice
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TextIO
 
 import typer
@@ -19,11 +24,14 @@ from typer.core import TyperCommand
 from gvo._text import cut, visible
 
 if TYPE_CHECKING:
+    from gvo.config import Config
+    from gvo.io.recording import Source
     from gvo.runs.result import RunResult
     from gvo.types import Progress
 
 # Share by which the total of a progress bar may be off.
 _MAX_OFF = 0.02
+_N_CHECKED = 200  # images of each stream, at the end of a run
 _MAX_CHATTER = 1 << 15  # bytes; half of what a pipe holds
 _EXIT_CODES_OF_SIGNALS: dict[int, int] = {
     number: 128 + number for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -32,6 +40,16 @@ EXIT_FAULTS = 1
 EXIT_UNUSABLE = 2
 
 
+# Verdicts at the start of a line or after the name of a recording.
+_VERDICT = re.compile(
+    r"^(?:gvo: )?(?:ok|warning|fault|error)\b|(?<=: )(?:healthy|\d+ (?:fault|warning)s?)\b|"
+    r"\bLikely cause:|\bWorth a look:"
+)
+_COLOURS = {
+    **{"fault": typer.colors.RED, "error": typer.colors.RED, "Likely": typer.colors.RED},
+    **{"warning": typer.colors.YELLOW, "Worth": typer.colors.YELLOW},
+    **{"ok": typer.colors.GREEN, "healthy": typer.colors.GREEN},
+}
 _LOGGER = logging.getLogger("gvo")
 _LEVELS = {True: logging.DEBUG, None: logging.WARNING, False: logging.ERROR}
 
@@ -111,7 +129,8 @@ def say(text: object, *, nl: bool = True, err: bool = False) -> None:
     """Print a result or a note, unless --quiet was given."""
     if _LOGGER.isEnabledFor(logging.WARNING):
         lines = [str(text)] if nl else str(text).split("\n")
-        echo("\n".join(map(visible, lines)), nl=nl, err=err)
+        stream = sys.stderr if err else sys.stdout
+        echo("\n".join(_fitted(visible(line), stream) for line in lines), nl=nl, err=err)
 
 
 def echo(text: str, *, nl: bool = True, err: bool = False) -> None:
@@ -121,6 +140,26 @@ def echo(text: str, *, nl: bool = True, err: bool = False) -> None:
     except OSError:
         stream = sys.stderr if err else sys.stdout
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def tell_error(error: Exception) -> None:
+    """Print an error."""
+    echo(_fitted(f"gvo: error: {error}", sys.stderr), err=True)
+
+
+def _fitted(line: str, stream: TextIO) -> str:
+    """Return a line that a terminal need not break within words, its verdicts in colours."""
+    if not stream.isatty():
+        return line
+    n_columns = shutil.get_terminal_size().columns
+    if len(line) > n_columns:
+        line = "\n".join(wrap(line, n_columns, break_long_words=False, break_on_hyphens=False))
+    return line if os.environ.get("NO_COLOR") else _VERDICT.sub(_coloured, line)
+
+
+def _coloured(verdict: re.Match[str]) -> str:
+    colour = next(colour for word, colour in _COLOURS.items() if word in verdict[0])
+    return typer.style(verdict[0], fg=colour, bold=True)
 
 
 def exit_code(is_complete: bool) -> int:
@@ -137,9 +176,27 @@ def report(result: RunResult, out: Path, *, is_stdout_taken: bool = False) -> No
 def tell(result: RunResult, out: Path, *, is_stdout_taken: bool = False) -> None:
     """Print a result."""
     say(f"{result}\n", nl=False, err=is_stdout_taken)
-    if result.report is None:
-        say(out, err=is_stdout_taken)
+    say(out if result.report is None else result.report, err=is_stdout_taken)
     warn(result.warnings)
+
+
+def tell_end(
+    result: RunResult, source: Source, parameters: Config, written: Sequence[Path], notes: str
+) -> None:
+    """Print a result, what `gvo check` finds wrong on the first images, and what was written."""
+    from gvo.diagnostics.check import check_recording, format_check
+    from gvo.io.recording import ChosenImages
+
+    say(f"{result}\n", nl=False)
+    warn(result.warnings)
+    info = replace(source.info, n_images=min(source.info.n_images, _N_CHECKED))
+    first = ChosenImages(info=info, images=lambda: islice(source.images(), 2 * _N_CHECKED))
+    if _LOGGER.isEnabledFor(logging.WARNING):  # not in vain
+        found = check_recording(first, parameters, n_samples=4)
+        wrong = replace(found, findings=found.with_verdict("fault", "warning"))
+        say(format_check(wrong) if wrong.findings else "gvo check: healthy\n", nl=False)
+    paths = [*written] if result.report is None else [result.report, *written[1:]]
+    say(f"wrote {', '.join(map(str, paths))}: {notes}")
 
 
 def warn(warnings: Sequence[str]) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
 
 from gvo.config import Config
 from gvo.types import ConstantError, RelativePose
@@ -19,8 +17,6 @@ DISPARITY, READOUT = "disparity_px", "readout_s"
 # by these factors.
 _DISPARITY_FACTOR = 3.0
 _READOUT_FACTOR = 5.0
-# A row offset of the right image, the median of many measurements, that is worth a word.
-_LEAST_ROW_PX = 0.04
 # An offset of the disparities that is not taken off, as registrations do not tell it from errors
 # that all of them share.
 _FEIGNED_PX = 0.05
@@ -237,25 +233,3 @@ class RigOffsets:
             "readout_ms": round(1e3 * self.readout.value, 2),
             "readout_sigma_ms": round(1e3 * self.readout.sigma, 2),
         }
-
-
-def describe_offsets(offsets: Mapping[str, Any] | None) -> str:
-    """Tell in words what was learnt of a camera, as `RigOffsets.as_json` gives it.
-
-    Only what is beyond two sigma is told; the result may be empty.
-    """
-    known = {key: value for key, value in (offsets or {}).items() if value is not None}
-    words = []
-    for key, text in (
-        ("disparity", "disparities {size:.3f} px too {side}"),
-        ("row", "rows of the right image {size:.3f} px too {side}"),
-        ("readout", "rows read out over {value:.1f} ms"),
-    ):
-        unit = "ms" if key == "readout" else "px"
-        value, sigma = known.get(f"{key}_{unit}", 0.0), known.get(f"{key}_sigma_{unit}")
-        if abs(value) <= (_LEAST_ROW_PX if sigma is None else 2.0 * sigma):
-            continue
-        side = "large" if value > 0.0 else "small"
-        suffix = "" if sigma is None else f" (sigma {sigma:.2g})" if sigma else ", as given"
-        words.append(text.format(value=value, size=abs(value), side=side) + suffix)
-    return ", ".join(words)

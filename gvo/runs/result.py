@@ -9,7 +9,6 @@ from typing import Any
 
 from gvo._text import visible
 from gvo.errors import said
-from gvo.frontend.offsets import describe_offsets
 from gvo.io.run_folder.verdict import loop_words, verdict
 from gvo.trajectory.evaluation import Evaluation, format_evaluations
 
@@ -40,7 +39,7 @@ class RunResult:
     report: Path | None = None
 
     def __repr__(self) -> str:
-        """Return what the command line prints of it: errors, verdict, where the report is."""
+        """Return what the command line prints of it: errors and verdict."""
         return said("\n".join(map(visible, self._lines())))
 
     def _lines(self) -> Iterator[str]:
@@ -50,17 +49,10 @@ class RunResult:
             yield f"ground truth: {summary['ground_truth']}"
         if self.evaluations:
             yield from format_evaluations(self.evaluations).splitlines()
-        yield from _smoothing_words(summary) if is_smoothed else _run_words(summary)
-        if self.report is not None:
-            yield str(self.report)
-
-
-def _run_words(summary: Mapping[str, Any]) -> Iterator[str]:
-    learnt = describe_offsets(summary["rig_offsets"])
-    if learnt:
-        yield f"learnt of the camera: {learnt}"
-    yield verdict(summary)
-    yield from filter(None, [loop_words(summary)])
+        if is_smoothed:
+            yield from _smoothing_words(summary)
+        else:
+            yield from filter(None, [verdict(summary), loop_words(summary)])
 
 
 def _smoothing_words(summary: Mapping[str, Any]) -> Iterator[str]:

@@ -19,6 +19,8 @@ AlignMode = Literal["none", "origin", "se3", "sim3"]
 MAX_DIFFERENCE_NS = 10_000_000
 """Largest difference of associated stamps, nanoseconds: 10 ms as in the TUM tools and evo."""
 
+_MIN_CORRELATION = 0.3
+
 MAX_GAP_NS = 250_000_000
 """Largest gap between poses that is interpolated, nanoseconds.
 
@@ -76,6 +78,54 @@ def pair(
             f"{_range(reference)}; give files of one recording and one clock"
         )
     return pairs
+
+
+def clock_offset(reference: Trajectory, estimate: Trajectory) -> int:
+    """Return what to add to the stamps of an estimate of another clock, nanoseconds.
+
+    Both turn and move at the same times: the rates of turning and moving correlate best.
+
+    Raises
+    ------
+    TrajectoryError
+        If they correlate nowhere.
+    """
+    from scipy.signal import correlate  # slow to import
+
+    step_ns = int(min(_step(reference), _step(estimate)))
+    rates, others = (_rates(each, step_ns) for each in (reference, estimate))
+    found = np.sum([correlate(a, b) for a, b in zip(rates, others, strict=True)], axis=0)
+    best = int(np.argmax(found))
+    least = _MIN_CORRELATION * np.sqrt(np.sum(rates**2) * np.sum(others**2))
+    if not 0 < best < len(found) - 1 or found[best] < least:
+        raise TrajectoryError("no offset of the clocks: the trajectories do not move alike")
+    before, peak, after = found[best - 1 : best + 2]
+    lag = best - (others.shape[1] - 1) + 0.5 * (before - after) / (before - 2.0 * peak + after)
+    return int(reference.stamps_ns[0] - estimate.stamps_ns[0] + round(lag * step_ns))
+
+
+def _rates(trajectory: Trajectory, step_ns: int) -> FloatArray:
+    """Return the rates of turning and moving at equal steps, shape (2, n), normalized."""
+    first_ns, last_ns = trajectory.stamps_ns[[0, -1]]
+    T = trajectory.interpolate(np.arange(first_ns, last_ns + 1, step_ns)).T_world_frame
+    steps = se3.invert(T[:-1]) @ T[1:]
+    rates = np.array([se3.rotation_angle(steps), np.linalg.norm(steps[:, :3, 3], axis=1)])
+    rates -= rates.mean(axis=1, keepdims=True)
+    return np.asarray(rates / np.maximum(rates.std(axis=1, keepdims=True), 1e-12))
+
+
+def synchronized(
+    reference: Trajectory, estimate: Trajectory, *, offset_ns: int, max_difference_ns: int | None
+) -> Trajectory:
+    """Return an estimate by the clock of its reference.
+
+    With a largest difference it has the stamps of the associated poses of the reference.
+    """
+    moved = replace(estimate, stamps_ns=estimate.stamps_ns + offset_ns)
+    if max_difference_ns is None:
+        return moved
+    ref, est = pair(reference, moved, max_difference_ns=max_difference_ns)
+    return replace(est, stamps_ns=ref.stamps_ns)
 
 
 def _step(trajectory: Trajectory) -> float:
@@ -136,7 +186,7 @@ def associate(
         raise TrajectoryError(
             f"{name} and the reference share no stamps within {max_difference_ns / 1e6:g} ms: "
             f"{name} {_range(estimate)}, reference {_range(reference)}; "
-            "give files of one recording and one clock"
+            "give files of one recording and one clock, or --offset auto"
         )
     return indices
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.special import gammaincinv
 
-from gvo._text import format_table, number_text
+from gvo._text import MAX_WIDTH, format_table, number_text
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
 from gvo.trajectory.alignment import MAX_DIFFERENCE_NS, MAX_GAP_NS, AlignMode, alignment, pair
@@ -20,25 +20,31 @@ KITTI_SEGMENTS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 """Segment lengths of the KITTI odometry benchmark, metres."""
 KITTI_STEP = 10
 """Poses between the starts of segments in the KITTI odometry benchmark."""
+SHORT_PATH_M = 200.0
+"""Paths shorter than this have the following segments, too, metres."""
 SHORT_SEGMENTS_M = (20.0, 50.0)
-"""Segment lengths for paths shorter than KITTI's longest segment, metres."""
+"""Their lengths, metres."""
 SHORT_STEP = 1
-"""Poses between the starts of those segments."""
+"""Poses between the starts of segments of those paths."""
 N_DOF = 6
 """Degrees of freedom of a pose and of an edge."""
 
 _MIN_PATH_M = 1e-6
+# A step stands out where its error is so many times that of nearly all others.
+_JUMP_FACTOR, _JUMP_QUANTILE, _N_JUMPS = 5.0, 0.9, 3
 _MIN_POSES = 3  # a rigid transform maps any two positions onto any other two
 SMOOTHED_GLOBAL = "smoothed = global"
 """How both are named where they are the same."""
 
 _HEADER = (
-    *("estimate", "poses", "of reference [%]", "ATE RMSE [m]", "ATE max [m]"),
-    *("RPE [m]", "RPE [deg]", "segments [m]", "t_err [%]", "r_err [deg/100 m]", "path ratio"),
+    *("estimate", "poses", "of reference [%]", "ATE RMSE [m]", "ATE mean [m]", "ATE median [m]"),
+    *("ATE std [m]", "ATE max [m]", "RPE RMSE [m]", "RPE RMSE [deg]", "segments [m]", "t_err [%]"),
+    *("r_err [deg/100 m]", "path ratio"),
 )
 _JSON_NAMES = (
-    *("name", "n", "reference_share", "ate_m", "ate_max_m", "rpe_m", "rpe_deg"),
-    *("n_segments", "segments_m", "t_pct", "r_deg_per_100m", "path_ratio"),
+    *("name", "n", "reference_share", "ate_m", "ate_mean_m", "ate_median_m", "ate_std_m"),
+    *("ate_max_m", "rpe_m", "rpe_deg", "n_segments", "segments_m", "t_pct", "r_deg_per_100m"),
+    *("path_ratio", "scale", "scaled_ate_m", "jumps"),
 )
 
 
@@ -73,6 +79,12 @@ class Evaluation:
     path_ratio : float or None
         Path length of the estimate, before scaling, over that of the reference; None if the
         reference does not move.
+    scale, scaled_ate_m : float or None
+        The factor of the estimate's positions that fits the reference best, and the ATE with it;
+        None if there is none.
+    jumps : tuple of (int, int, float)
+        Largest errors of single steps that stand out of all others, at most three: the number of
+        the pose after it in the estimate, its stamp in nanoseconds, metres.
     """
 
     name: str
@@ -86,6 +98,9 @@ class Evaluation:
     segments_m: tuple[float, ...]
     reference_share: float
     path_ratio: float | None
+    scale: float | None = None
+    scaled_ate_m: float | None = None
+    jumps: tuple[tuple[int, int, float], ...] = ()
 
     def __repr__(self) -> str:
         """Return one line: how many poses, and the root mean squares of their errors."""
@@ -101,6 +116,21 @@ class Evaluation:
     def ate_m(self) -> float:
         """Absolute trajectory error: root mean square of the position errors, metres."""
         return float(np.sqrt(np.mean(self.errors_m**2)))
+
+    @property
+    def ate_mean_m(self) -> float:
+        """Mean of the position errors, metres."""
+        return float(np.mean(self.errors_m))
+
+    @property
+    def ate_median_m(self) -> float:
+        """Median of the position errors, metres."""
+        return float(np.median(self.errors_m))
+
+    @property
+    def ate_std_m(self) -> float:
+        """Standard deviation of the position errors, metres."""
+        return float(np.std(self.errors_m))
 
     @property
     def ate_max_m(self) -> float:
@@ -127,10 +157,11 @@ def evaluate(
             f"{_MIN_POSES}"
         )
     aligned = alignment(ref, est, align).apply(est)
-    usual_segments, usual_step = _usual_segments(ref)
-    segments = usual_segments if segments is None else segments
+    usual, usual_step = usual_segments(ref)
+    segments = usual if segments is None else segments
     segment_step = usual_step if segment_step is None else segment_step
     step_t, step_r = relative_errors(ref, aligned, delta=rpe_delta)
+    scale, scaled_ate_m = _scale(ref, est)
     shares, turns = segment_errors(ref, aligned, lengths_m=segments, step=segment_step)
     return Evaluation(
         name=name,
@@ -144,6 +175,9 @@ def evaluate(
         segments_m=tuple(float(length) for length in segments),
         reference_share=_reference_share(reference, ref),
         path_ratio=_path_ratio(ref, est),
+        scale=scale,
+        scaled_ate_m=scaled_ate_m,
+        jumps=_jumps(estimate, ref, aligned),
     )
 
 
@@ -208,10 +242,12 @@ def _segments_of(
     return first[fits], last[fits], length[fits]
 
 
-def _usual_segments(path: Trajectory) -> tuple[tuple[float, ...], int]:
-    """Return KITTI's lengths and step for a path of its longest segment, else the short ones."""
-    is_long = _path_length(path) >= KITTI_SEGMENTS_M[-1]
-    return (KITTI_SEGMENTS_M, KITTI_STEP) if is_long else (SHORT_SEGMENTS_M, SHORT_STEP)
+def usual_segments(path: Trajectory) -> tuple[tuple[float, ...], int]:
+    """Return KITTI's lengths that a path holds, and its step; of a short one 20 and 50 m too."""
+    path_m = _path_length(path)
+    held = tuple(length for length in KITTI_SEGMENTS_M if length < path_m)
+    is_short = path_m < SHORT_PATH_M
+    return ((*SHORT_SEGMENTS_M, *held), SHORT_STEP) if is_short else (held, KITTI_STEP)
 
 
 def _have_rotations(reference: Trajectory, estimate: Trajectory) -> bool:
@@ -243,6 +279,29 @@ def _path_length(trajectory: Trajectory) -> float:
 def _path_ratio(reference: Trajectory, estimate: Trajectory) -> float | None:
     length = _path_length(reference)
     return _path_length(estimate) / length if length > _MIN_PATH_M else None
+
+
+def _scale(reference: Trajectory, estimate: Trajectory) -> tuple[float, float] | tuple[None, None]:
+    """Return the scale that fits an associated estimate best, and the ATE with it."""
+    try:
+        fit = alignment(reference, estimate, "sim3")
+    except TrajectoryError:  # the two do not move alike
+        return None, None
+    errors = reference.positions - fit.apply(estimate).positions
+    return fit.scale, float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+
+
+def _jumps(
+    whole: Trajectory, reference: Trajectory, estimate: Trajectory
+) -> tuple[tuple[int, int, float], ...]:
+    """Return the steps of an aligned estimate whose errors stand out, the largest first."""
+    steps = [np.diff(each.positions, axis=0) for each in (reference, estimate)]
+    errors = np.linalg.norm(steps[1] - steps[0], axis=1)
+    largest = np.argsort(-errors)[:_N_JUMPS]
+    far = largest[errors[largest] > _JUMP_FACTOR * np.quantile(errors, _JUMP_QUANTILE)]
+    stamps_ns = estimate.stamps_ns[far + 1]
+    rows = zip(np.searchsorted(whole.stamps_ns, stamps_ns), stamps_ns, errors[far], strict=True)
+    return tuple((int(row), int(stamp_ns), float(error)) for row, stamp_ns, error in rows)
 
 
 def _reference_share(reference: Trajectory, associated: Trajectory) -> float:
@@ -308,7 +367,7 @@ def motions_of_chain(chain: Trajectory) -> list[Motions]:
         first = np.flatnonzero(last < len(chain))
         first = first[stamps_ns[last[first]] - stamps_ns[first] <= 1.5 * span_ns]
         found.append(Motions.of_chain(chain, first, last[first], name=f"raw over {span_s} s"))
-    lengths, step = _usual_segments(chain)
+    lengths, step = usual_segments(chain)
     first, last, _ = _segments_of(chain, lengths, step)
     name = f"raw over {lengths[0]:g} to {lengths[-1]:g} m"
     return [*found, Motions.of_chain(chain, first, last, name=name)]
@@ -449,8 +508,19 @@ def chi2_bound(share: float, n_dof: int = N_DOF) -> float:
 
 
 def format_evaluations(evaluations: Sequence[Evaluation]) -> str:
-    """Return a table of text with a row per evaluation; "-" for missing values."""
-    return format_table(*evaluation_table(evaluations))
+    """Return a table of text with a column per evaluation, of 80 characters; "-" for no value.
+
+    Of many evaluations, or long names, there are several tables below each other.
+    """
+    header, rows = evaluation_table(evaluations)
+    room, tables = MAX_WIDTH - max(map(len, header)), list[str]()
+    while rows or not tables:
+        widths = np.cumsum([2 + max(map(len, row)) for row in rows])
+        n_columns = max(1, int(np.searchsorted(widths, room, side="right")))
+        names, *measures = zip(header, *rows[:n_columns], strict=True)
+        tables.append(format_table(names, measures))
+        rows = rows[n_columns:]
+    return "\n".join(tables)
 
 
 def evaluation_table(
@@ -481,12 +551,15 @@ def evaluations_json(evaluations: Sequence[Evaluation]) -> dict[str, list[dict[s
 
 
 def _cells(evaluation: Evaluation) -> tuple[str, ...]:
+    position_errors = (
+        *(evaluation.ate_m, evaluation.ate_mean_m, evaluation.ate_median_m),
+        *(evaluation.ate_std_m, evaluation.ate_max_m),
+    )
     return (
         evaluation.name,
         str(evaluation.n),
         f"{100.0 * evaluation.reference_share:.1f}",
-        f"{evaluation.ate_m:.4f}",
-        f"{evaluation.ate_max_m:.4f}",
+        *(f"{value:.4f}" for value in position_errors),
         number_text(evaluation.rpe_m, ".4f"),
         number_text(evaluation.rpe_deg, ".4f"),
         _segments(evaluation),

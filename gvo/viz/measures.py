@@ -74,6 +74,13 @@ def _paired(truth: Trajectory, estimate: Trajectory, name: str) -> tuple[Traject
         return pair(replace(truth, stamps_from="topic"), estimate, name=name)
 
 
+def truth_around(truth: Trajectory, parts: Sequence[Trajectory]) -> Trajectory:
+    """Return the ground truth within the span of the associated poses."""
+    first_ns = min(int(part.stamps_ns[0]) for part in parts)
+    last_ns = max(int(part.stamps_ns[-1]) for part in parts)
+    return truth.select((truth.stamps_ns >= first_ns) & (truth.stamps_ns <= last_ns))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Drift:
     """Mean errors over the segments of each length, shape (k,)."""

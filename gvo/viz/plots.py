@@ -61,7 +61,7 @@ def plot_trajectories(
         raise ValueError("expected at least one estimate, and poses in each")
     # Matplotlib takes a third of a second to load.
     from gvo.viz.figures import save_figure, style
-    from gvo.viz.trajectories import figure_of_errors, figure_of_positions
+    from gvo.viz.report.trajectories import figure_of_errors, figure_of_positions
 
     with style():
         if reference is None:

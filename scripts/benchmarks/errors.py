@@ -119,8 +119,11 @@ def errors_of(source: Source, settings: Sequence[str], *, first: int = 0) -> Mea
         *motions_of_chain(trajectories["raw"])[: len(SPANS_S)],
         *(motions_of_window(edges, name="window") for edges in in_window.values()),
     ]
+    segments = {"segments": [20.0, 50.0], "segment_step": 1}
     return Measured(
-        evaluations={name: gvo.evaluate(truth, t, name=name) for name, t in trajectories.items()},
+        evaluations={
+            name: gvo.evaluate(truth, t, name=name, **segments) for name, t in trajectories.items()
+        },
         nees=[mean_nees(truth, each) for each in motions],
     )
 

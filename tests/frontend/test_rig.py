@@ -17,7 +17,7 @@ import gvo
 from gvo.config import Config
 from gvo.frontend import klt
 from gvo.frontend.factory import make_frontend
-from gvo.frontend.offsets import ConstantFilter, RigOffsets, VarianceFactor, describe_offsets
+from gvo.frontend.offsets import ConstantFilter, RigOffsets, VarianceFactor
 from gvo.frontend.rig import FrameMotion, MeasuredVelocity, note_step
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
@@ -270,28 +270,6 @@ def test_nothing_is_learnt_where_it_is_switched_off() -> None:
         "readout_ms": 12.5,
         "readout_sigma_ms": 0.0,
     }
-
-
-def test_what_is_learnt_is_told_in_words() -> None:
-    assert describe_offsets(None) == ""
-    assert describe_offsets(RigOffsets(config(), is_stereo=False).as_json()) == ""
-    assert describe_offsets(RigOffsets(config(20.0)).as_json()) == (
-        "rows read out over 20.0 ms, as given"
-    )
-    learnt = {
-        "disparity_px": -0.158,
-        "disparity_sigma_px": 0.022,
-        "row_px": 0.12,
-        "readout_ms": 23.9,
-        "readout_sigma_ms": 1.0,
-    }
-    assert describe_offsets(learnt) == (
-        "disparities 0.158 px too small (sigma 0.022), rows of the right image 0.120 px too "
-        "large, rows read out over 23.9 ms (sigma 1)"
-    )
-    assert describe_offsets(learnt | {"disparity_px": 0.04, "row_px": -0.03}) == (
-        "rows read out over 23.9 ms (sigma 1)"
-    )
 
 
 @dataclass(frozen=True, eq=False)

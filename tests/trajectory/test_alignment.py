@@ -1,5 +1,7 @@
 """Association and alignment against brute force and known motions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,7 +11,16 @@ from scipy.spatial.transform import Rotation
 
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
-from gvo.trajectory.alignment import MAX_GAP_NS, AlignMode, Similarity, alignment, associate, pair
+from gvo.trajectory.alignment import (
+    MAX_GAP_NS,
+    AlignMode,
+    Similarity,
+    alignment,
+    associate,
+    clock_offset,
+    pair,
+    synchronized,
+)
 from gvo.trajectory.trajectory import StampsFrom, Trajectory
 from tests.trajectory.paths import random_trajectory, seeds, still, unturned
 
@@ -231,3 +242,28 @@ def test_positions_without_rotations_are_aligned_but_not_by_their_first_pose() -
         assert aligned.has_rotations == estimate.has_rotations
         with pytest.raises(TrajectoryError, match=r"positions without rotations.*align by se3"):
             alignment(reference, estimate, "origin")
+
+
+@pytest.mark.parametrize("offset_s", [0.0, 0.037, -12.3, 1000.5])
+def test_the_offset_of_another_clock_is_found(offset_s: float) -> None:
+    phases = np.outer(np.arange(400) * 0.05, [0.9, 0.5, 0.31, 1.3, 0.7, 1.1])
+    swaying = np.sin(phases) + 0.5 * np.sin(2.3 * phases)
+    stamps_ns = 10**18 + np.arange(400) * 50_000_000
+    reference = Trajectory(stamps_ns=stamps_ns, T_world_frame=se3.exp(0.3 * swaying))
+    # a part of it, at other times, seen from another world
+    part = reference.interpolate(stamps_ns[60:300:2] + 13_000_000).moved(se3.exp(swaying[3]))
+    estimate = replace(part, stamps_ns=part.stamps_ns - round(1e9 * offset_s))
+    found_ns = clock_offset(reference, estimate)
+    assert found_ns == pytest.approx(1e9 * offset_s, abs=5e6)
+    back = synchronized(reference, estimate, offset_ns=found_ns, max_difference_ns=20_000_000)
+    assert np.isin(back.stamps_ns, stamps_ns).all()
+    assert len(back) > 110
+
+
+def test_no_offset_is_found_of_what_moves_otherwise() -> None:
+    rng = np.random.default_rng(0)
+    stamps_ns = np.arange(100) * 100_000_000
+    walks = [se3.exp(rng.normal(size=(100, 6)).cumsum(axis=0) * 0.01) for _ in range(2)]
+    first, second = (Trajectory(stamps_ns=stamps_ns, T_world_frame=T) for T in walks)
+    with pytest.raises(TrajectoryError, match="no offset of the clocks"):
+        clock_offset(first, second)

@@ -15,10 +15,12 @@ from hypothesis import given
 
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
+from gvo.io.run_folder.verdict import likely_causes
 from gvo.trajectory.alignment import AlignMode, Similarity
 from gvo.trajectory.evaluation import (
     Evaluation,
     evaluate,
+    evaluations_json,
     relative_errors,
     truth_jump,
 )
@@ -59,8 +61,8 @@ def measures(evaluation: Evaluation) -> list[float | None]:
     ]
 
 
-def run_evo(folder: Path, *arguments: str | Path) -> float:
-    """Return the RMSE that an evo program computes, in full precision."""
+def run_evo(folder: Path, *arguments: str | Path) -> dict[str, float]:
+    """Return the statistics that an evo program computes, in full precision."""
     program = Path(sys.executable).parent / str(arguments[0])
     results = folder / "results.zip"
     results.unlink(missing_ok=True)
@@ -71,7 +73,7 @@ def run_evo(folder: Path, *arguments: str | Path) -> float:
         env={**os.environ, "HOME": str(folder)},
     )
     with zipfile.ZipFile(results) as archive:
-        return float(json.loads(archive.read("stats.json"))["rmse"])
+        return dict(json.loads(archive.read("stats.json")))
 
 
 def devkit_errors(
@@ -101,7 +103,10 @@ def devkit_errors(
 @pytest.mark.parametrize(
     ("n", "step_m", "lengths", "step", "options"),
     [
-        (200, 0.5, [20.0, 50.0], 1, {}),
+        (150, 0.5, [20.0, 50.0], 1, {}),
+        # KITTI's lengths where the path holds them, by its step from 200 m on
+        (150, 1.0, [20.0, 50.0, 100.0], 1, {}),
+        (260, 1.0, [100.0, 200.0], 10, {}),
         (700, 2.0, [100.0 * k for k in range(1, 9)], 10, {}),
         (150, 1.0, [30.0], 7, {"segments": [30.0], "segment_step": 7}),
         (40, 0.1, [0.5], 1, {"segments": [0.5]}),  # of a hand
@@ -242,14 +247,46 @@ def test_ate_and_rpe_are_those_of_evo(tmp_path: Path) -> None:
     )
     rows = evaluate(*map(read_trajectory, kitti), name="e", align="origin", rpe_delta=3)
     pairs = ["--align_origin", "-d", "3", "-u", "f", "--all_pairs"]
-    programs: list[tuple[float | None, list[str | Path]]] = [
-        (rigid.ate_m, ["evo_ape", "tum", *tum, "-a"]),
-        (scaled.rpe_m, ["evo_rpe", "tum", *tum, "-as", "-d", "1", "-u", "f"]),
-        (rows.ate_m, ["evo_ape", "kitti", *kitti, "--align_origin"]),
-        (rows.rpe_deg, ["evo_rpe", "kitti", *kitti, *pairs, "-r", "angle_deg"]),
+    programs: list[tuple[dict[str, float | None], list[str | Path]]] = [
+        (
+            {
+                "rmse": rigid.ate_m,
+                "mean": rigid.ate_mean_m,
+                "median": rigid.ate_median_m,
+                "std": rigid.ate_std_m,
+                "max": rigid.ate_max_m,
+            },
+            ["evo_ape", "tum", *tum, "-a"],
+        ),
+        ({"rmse": scaled.rpe_m}, ["evo_rpe", "tum", *tum, "-as", "-d", "1", "-u", "f"]),
+        ({"rmse": rows.ate_m}, ["evo_ape", "kitti", *kitti, "--align_origin"]),
+        ({"rmse": rows.rpe_deg}, ["evo_rpe", "kitti", *kitti, *pairs, "-r", "angle_deg"]),
     ]
     for found, program in programs:
-        assert found == pytest.approx(run_evo(tmp_path, *program), abs=1e-6)
+        stats = run_evo(tmp_path, *program)
+        assert found == pytest.approx({key: stats[key] for key in found}, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("factor", "jump_m", "causes"),
+    [
+        (1.0, 0.0, []),
+        (0.9, 0.0, ["the scale, the path is 0.9 times as long as the true one (is the baseline"]),
+        (1.0, 3.0, ["a jump of 3 m at frame 100 (1000000010.000 s)"]),
+        (4.0, 30.0, ["the scale, the path is 4.", "a jump of 1"]),
+    ],
+)
+def test_the_likely_cause_of_errors_comes_first(
+    factor: float, jump_m: float, causes: list[str]
+) -> None:
+    reference = drive(200)
+    T = disturbed(reference, sigma=1e-4).T_world_frame.copy()
+    T[100:, 0, 3] += jump_m
+    T[:, :3, 3] *= factor
+    estimate = Trajectory(stamps_ns=reference.stamps_ns, T_world_frame=T)
+    row = json.loads(json.dumps(evaluations_json([evaluate(reference, estimate, name="")])))
+    found = likely_causes(row["estimates"][0], sensor="stereo")
+    assert [each[: len(start)] for each, start in zip(found, causes, strict=True)] == causes
 
 
 @pytest.mark.recorded

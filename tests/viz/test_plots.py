@@ -89,7 +89,7 @@ def test_without_a_reference_the_positions_are_drawn(tmp_path: Path) -> None:
     text = svg_text(tmp_path, None, {"raw": curve(1), "smoothed": curve(2)})
     for label in ("x [m]", "y [m]", "z [m]", "elapsed [s]", "raw", "smoothed"):
         assert f">{label}</text>" in text
-    assert "reference" not in text
+    assert "truth" not in text
 
 
 def test_a_notebook_shows_the_figure_that_is_written(tmp_path: Path) -> None:

@@ -8,13 +8,15 @@ from dataclasses import asdict, dataclass, replace
 from itertools import takewhile
 from typing import Literal, TypeAlias
 
-from gvo._text import format_table, visible
+from gvo._text import visible, wrapped
 from gvo.errors import said
 
 Verdict: TypeAlias = Literal["ok", "warning", "fault", "info", "unknown"]
 _N_DIGITS = 3
 _MAX_PLAIN = 1e7
-_HEADER = ("check", "value", "threshold", "verdict", "fix")
+# Where names and values begin; a longer name moves its value.
+_NAME_COLUMN, _VALUE_COLUMN = 9, 41
+_HEADER = f"{'verdict':9}{'check':32}value [threshold]"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,9 +118,10 @@ def number_text(value: float) -> str:
 
 
 def format_check(result: CheckResult) -> str:
-    """Return the first infos, an aligned table of the other findings, and a summary.
+    """Return the first infos, the other findings with their verdicts, and a summary.
 
-    Two streams (left and right, colour and depth) share a line if both are ok.
+    Two streams (left and right, colour and depth) share an entry if both are ok. No line is longer
+    than 80 characters, unless a word is.
 
     Examples
     --------
@@ -126,23 +129,40 @@ def format_check(result: CheckResult) -> str:
     ...     Finding(name="recording", value="stereo, 50 + 50 images"),
     ...     Finding(name="left: gaps", value=0.1, unit="s", threshold="<= 0.5 s", verdict="ok"),
     ...     Finding(name="right: gaps", value=0.2, unit="s", threshold="<= 0.5 s", verdict="ok"),
+    ...     Finding(
+    ...         name="baseline",
+    ...         value=53.7,
+    ...         unit="m",
+    ...         threshold="0.01 .. 3 m",
+    ...         verdict="warning",
+    ...         fix="check the unit",
+    ...     ),
     ... )
     >>> print(format_check(CheckResult(recording="drive", findings=findings)), end="")
     stereo, 50 + 50 images
-    check              value          threshold  verdict  fix
-    left, right: gaps  0.1 s | 0.2 s  <= 0.5 s   ok
-    drive: healthy
+    verdict  check                           value [threshold]
+    ok       left, right: gaps               0.1 s | 0.2 s [<= 0.5 s]
+    warning  baseline                        53.7 m [0.01 .. 3 m]
+             check the unit
+    drive: 1 warning; look first at baseline
     """
     head = [finding.value_text for finding in takewhile(_is_info, result.findings)]
-    findings = list(_merged(result.findings[len(head) :]))
-    rows = [(f.name, f.value_text, f.threshold, f.verdict, f.fix) for f in findings]
-    # Infos, however long, do not widen the columns of the others.
-    wide = [
-        (row[0], "", "", "", "") if _is_info(finding) else row
-        for row, finding in zip(rows, findings, strict=True)
-    ]
-    table = format_table(_HEADER, rows, is_text=True, measured=wide)
-    return "".join([*(f"{line}\n" for line in head), table, f"{visible(_sum_up(result))}\n"])
+    others = _merged(result.findings[len(head) :])
+    entries = (line for finding in others for line in _entry(finding))
+    lines = [*(line for text in head for line in wrapped(visible(text))), _HEADER, *entries]
+    return "".join(f"{line}\n" for line in [*lines, visible(_sum_up(result))])
+
+
+def _entry(finding: Finding) -> Iterator[str]:
+    """Yield the lines of a finding: verdict, name, value and threshold; below them the fix."""
+    threshold = f" [{finding.threshold}]" if finding.threshold else ""
+    start = f"{finding.verdict:9}{finding.name:30}  {finding.value_text}"
+    # a threshold is not broken
+    text = visible(start) + threshold[:1] + threshold[1:].replace(" ", "\xa0")
+    for line in wrapped(text, " " * _VALUE_COLUMN):
+        yield line.replace("\xa0", " ")
+    if finding.fix:
+        yield from wrapped(f"{' ' * _NAME_COLUMN}{visible(finding.fix)}", " " * _NAME_COLUMN)
 
 
 def _is_info(finding: Finding) -> bool:
@@ -181,4 +201,6 @@ def _sum_up(result: CheckResult) -> str:
     verdicts: tuple[Verdict, ...] = ("fault", "warning")
     counts = [(len(result.with_verdict(verdict)), verdict) for verdict in verdicts]
     parts = [f"{n} {verdict}{'s' if n > 1 else ''}" for n, verdict in counts if n]
-    return f"{result.recording}: {', '.join(parts) or 'healthy'}"
+    worst = [each.name for verdict in verdicts for each in result.with_verdict(verdict)]
+    look = f"; look first at {worst[0]}" if worst else ""
+    return f"{result.recording}: {', '.join(parts) or 'healthy'}{look}"

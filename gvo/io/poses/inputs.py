@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +31,6 @@ from gvo.io.poses.truth import (
 )
 from gvo.io.recording import Source
 from gvo.trajectory import evaluation
-from gvo.trajectory.alignment import MAX_DIFFERENCE_NS, AlignMode
 from gvo.trajectory.evaluation import Evaluation
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
@@ -136,11 +136,7 @@ def evaluate(
     estimate: Trajectory | str | Path,
     *,
     name: str | None = None,
-    align: AlignMode = "se3",
-    segments: Sequence[float] | None = None,
-    segment_step: int | None = None,
-    max_difference_ns: int = MAX_DIFFERENCE_NS,
-    rpe_delta: int = 1,
+    **options: Any,  # noqa: ANN401 - of several types
 ) -> Evaluation:
     """Associate an estimate with its reference, align it and measure its errors.
 
@@ -177,14 +173,7 @@ def evaluate(
     truth = _given(reference)
     found = _given(estimate, truth)
     return evaluation.evaluate(
-        truth.trajectory,
-        found.trajectory,
-        name=name or found.name,
-        align=align,
-        segments=segments,
-        segment_step=segment_step,
-        max_difference_ns=max_difference_ns,
-        rpe_delta=rpe_delta,
+        truth.trajectory, found.trajectory, name=name or found.name, **options
     )
 
 

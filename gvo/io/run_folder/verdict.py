@@ -14,14 +14,50 @@ _FIT_FACTOR = 2.0
 # What was learnt of a camera is told from here on, and where it is more than three sigmas.
 _OFFSET_PX = 0.1
 _READOUT_MS = 5.0
+# A scale is wrong that is off by more than this, and without which so much of the ATE is left.
+_SCALE, _SCALED_SHARE = 0.02, 0.4
+# A jump matters that is so large a share of the ATE.
+_JUMP_SHARE = 0.25
+_SCALED_BY = {"stereo": "the baseline", "rgbd": "depth.scale"}
 
 
 def verdict(summary: Mapping[str, Any]) -> str:
-    """Say how far a run came, how good it is, and what is worth a look, from its `summary.json`."""
-    parts = [_how_far(summary), _how_good(summary), _how_sure(summary)]
+    """Say how far a run came, how good it is, and what is likely wrong, from its `summary.json`."""
+    best = _best(summary)
+    causes = [] if best is None else likely_causes(best, sensor=summary.get("sensor", ""))
     looks = [*_looks_at_frames(summary), *_looks_at_camera(summary.get("rig_offsets") or {})]
-    text = "; ".join(part for part in parts if part)
-    return f"{text}. Worth a look: {'; '.join(looks)}." if looks else f"{text}."
+    sure = _how_sure(summary)
+    sentences = [
+        "; ".join(filter(None, [_how_far(summary), _how_good(summary)])),
+        causes and f"Likely cause: {'; '.join(causes)}",
+        looks and f"Worth a look: {'; '.join(looks)}",
+        sure and f"Covariances {sure}",
+    ]
+    return " ".join(f"{sentence}." for sentence in sentences if sentence)
+
+
+def likely_causes(errors: Mapping[str, Any], *, sensor: str = "") -> list[str]:
+    """Say what the errors of an estimate likely come from, the most likely cause first.
+
+    Parameters
+    ----------
+    errors : mapping
+        A row of `evaluations_json`.
+    sensor : {"stereo", "rgbd", ""}
+    """
+    causes, ate_m = [], errors["ate_m"]
+    scale, scaled_m = errors.get("scale"), errors.get("scaled_ate_m")
+    if scale is not None and abs(scale - 1.0) > _SCALE and scaled_m < _SCALED_SHARE * ate_m:
+        what = _SCALED_BY.get(sensor, "the baseline, or depth.scale,")
+        causes.append(
+            f"the scale, the path is {1.0 / scale:.3g} times as long as the true one (is {what} "
+            f"right? times {scale:.3g}, errors fall to {scaled_m:.2g} m)"
+        )
+    jumps = [each for each in errors.get("jumps") or () if each[2] > _JUMP_SHARE * ate_m]
+    if jumps:
+        words = (f"{error_m:.3g} m at frame {n} ({1e-9 * ns:.3f} s)" for n, ns, error_m in jumps)
+        causes.append(f"{'jumps' if len(jumps) > 1 else 'a jump'} of {', '.join(words)}")
+    return causes
 
 
 def _how_far(summary: Mapping[str, Any]) -> str:
@@ -48,15 +84,20 @@ def _segment_words(segments: Sequence[Mapping[str, Any]]) -> list[str]:
     return [f"in {len(segments)} segments, {n_joined} of them joined to another"]
 
 
-def _how_good(summary: Mapping[str, Any]) -> str:
+def _best(summary: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """Return the errors of the best poses: the global ones where loops were closed."""
     errors = {row["name"]: row for row in summary.get("errors", ())}
     loops = (summary.get(GLOBAL) or {}).get("loops") or {}
     is_closed = GLOBAL in errors and loops.get("counted", 0) > 0
-    best = errors.get(GLOBAL if is_closed else "smoothed")
+    return errors.get(GLOBAL if is_closed else "smoothed")
+
+
+def _how_good(summary: Mapping[str, Any]) -> str:
+    best = _best(summary)
     if best is not None:
         n, n_true = summary["frames"], best["n"]
         where = "" if n_true >= 0.9 * n else f", known of {n_true} frames"
-        how = " with loops closed" if is_closed else ""
+        how = " with loops closed" if best["name"] == GLOBAL else ""
         return f"{best['ate_m']:.2g} m from the truth{how}{where}"
     if any(str(each).startswith("not compared") for each in summary.get("warnings", ())):
         return "not compared with the truth"
@@ -84,15 +125,15 @@ def _how_sure(summary: Mapping[str, Any]) -> str:
     row = rows[0]
     factor, span = row["nees"] ** 0.5, row["motion"].partition(" ")[2]
     if factor < 1.0 / _FIT_FACTOR and row["nees"] < row["nees_low"]:
-        return f"covariances too large, {1.0 / factor:.2g} times in sigma"
+        return f"are too large, {1.0 / factor:.2g} times in sigma"
     if factor <= _FIT_FACTOR or row["nees"] <= row["nees_high"]:
-        return "covariances fit"
+        return "fit"
     # Noise of the true poses is as large from frame to frame; errors of a motion add up.
     jump_m = summary.get("truth_jump_m") or 0.0
     if jump_m > 0.5 * row["error_m"]:
-        return f"covariances cannot be judged, the truth jumps by {jump_m:.2g} m between frames"
+        return f"cannot be judged, the truth jumps by {jump_m:.2g} m between frames"
     return (
-        f"covariances too small, {factor:.2g} times in sigma, unless the truth itself is off by "
+        f"are too small, {factor:.2g} times in sigma, unless the truth itself is off by "
         f"{row['error_m']:.2g} m and {row['error_deg']:.2g} deg {span}"
     )
 

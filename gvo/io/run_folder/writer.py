@@ -66,11 +66,16 @@ _RESULTS = (
 
 
 def free_folder(recording: str | Path, what: str = "") -> Path:
-    """Return a new folder in the working folder: `gvo-RECORDING`, numbered where that is taken."""
+    """Return a new folder in the working folder: `usual_folder`, numbered where that is taken."""
+    return free_path(usual_folder(recording, what))
+
+
+def usual_folder(recording: str | Path, what: str = "") -> Path:
+    """Return `gvo-RECORDING` in the working folder."""
     path = Path(recording)
     path = path if path.name not in ("", "..") else path.resolve()
     name = path.name if path.is_dir() else Path(path.name.removesuffix(".zst")).stem
-    return free_path(Path(f"gvo-{visible(name)}{what}"))
+    return Path(f"gvo-{visible(name)}{what}")
 
 
 def free_path(path: Path) -> Path:

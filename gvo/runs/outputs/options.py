@@ -46,7 +46,12 @@ class RunOutputs:
     def __post_init__(self) -> None:
         """Refuse contradictory options."""
         if self.plots is not None and not self.report:
-            raise ConfigurationError("--plots are those of the report: not with --no-report")
+            raise ConfigurationError("--plots are those of the report, which is not written")
+
+    @property
+    def files(self) -> list[Path]:
+        """The bag, the film and the file for Rerun, as far as they are asked for."""
+        return [path for path in (self.bag, self.overlay, self.rerun) if path is not None]
 
     def check(self, *, force: bool = False) -> None:
         """Refuse files that exist or cannot be written, before any work; nothing is made.
@@ -61,9 +66,8 @@ class RunOutputs:
         RecordingError
             With what to do.
         """
-        for path in (self.bag, self.overlay, self.rerun):
-            if path is not None:
-                check_new(path)
+        for path in self.files:
+            check_new(path)
         if self.plots is not None:
             check_folder(self.plots)
             if not force:

@@ -147,7 +147,7 @@ def _view(
 ) -> Figure:
     figure = new_figure(_HEIGHT, HALF)
     axes = figure.subplots()
-    _draw_lines(axes, lines, plane)
+    draw_lines(axes, lines, plane)
     axes.set(xlabel=labels[plane[0]], ylabel=labels[plane[1]])
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.04)
@@ -157,7 +157,8 @@ def _view(
     return figure
 
 
-def _draw_lines(axes: Any, lines: Sequence[Line], order: tuple[int, ...]) -> None:  # noqa: ANN401
+def draw_lines(axes: Any, lines: Sequence[Line], order: tuple[int, ...]) -> None:  # noqa: ANN401
+    """Draw paths in some axes of the world, and the start of the first one."""
     for line in lines:
         axes.plot(*line.points[:, order].T, label=plain(line.name), **asdict(line.style))
     axes.plot(*lines[0].points[:1, order].T, "o", label="start", **HOLLOW)
@@ -167,7 +168,7 @@ def _space(lines: Sequence[Line], labels: Sequence[str], world: World) -> Figure
     figure = new_figure(HALF, 1.2 * HALF)
     axes: Any = figure.add_subplot(projection="3d")
     order = (*world.ground, world.up)
-    _draw_lines(axes, lines, order)
+    draw_lines(axes, lines, order)
     _set_box(axes, np.concatenate([line.points for line in lines])[:, order])
     right, ahead, up = (labels[axis] for axis in order)
     axes.set(xlabel=right, ylabel=ahead, zlabel=up)

@@ -10,22 +10,25 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
 
 from gvo.io.run_folder.reader import Table
 from gvo.trajectory.alignment import AlignMode
 from gvo.trajectory.evaluation import (
     KITTI_SEGMENTS_M,
     N_DOF,
-    SHORT_SEGMENTS_M,
     Consistency,
     chi2_bound,
+    usual_segments,
 )
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
 from gvo.viz import palette
 from gvo.viz.figures import (
     MANY,
     Plot,
     draw_curve,
+    draw_segments,
     elapsed,
     legend_above,
     new_figure,
@@ -34,8 +37,12 @@ from gvo.viz.figures import (
 )
 from gvo.viz.measures import Comparison, Drift, chi2_density, drift, drift_lengths
 from gvo.viz.palette import Style, styles_of
+from gvo.viz.report.paths import World
+from gvo.viz.report.trajectories import ANGLES, POSITIONS, draw_values
 
-_ROW_HEIGHT = 2.1
+_ROW_HEIGHT, _PATH_HEIGHT = 2.1, 4.2
+# Axes of a camera turned to forward, left, up.
+_FLU_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _SIGMAS = 3.0
 _RAW = Style(color=palette.ESTIMATES["raw"], linewidth=1.1, zorder=3.0)
 # index into errors, letter and unit: translations in the upper row, rotations below
@@ -52,6 +59,9 @@ _N_BINS = 60
 
 
 TITLES = {
+    "error_path": "Errors along the path",
+    "positions": "Position over time",
+    "angles": "Roll, pitch and yaw over time",
     "errors_over_time": "Errors over time",
     "errors_over_distance": "Errors over distance travelled",
     "drift": "Drift by length of segment",
@@ -77,6 +87,50 @@ def _not_drawn(slug: str, reason: str) -> Plot:
 def _plot(slug: str, figure: Figure, **facts: object) -> Plot:
     """Return a plot, whose words are in `pages/plots.html`."""
     return Plot(slug=slug, title=TITLES[slug], figure=figure, facts=facts)
+
+
+def pose_plots(truth: Trajectory, comparisons: Sequence[Comparison], world: World) -> list[Plot]:
+    """Return the paths coloured by their errors, and positions and angles over time."""
+    estimates = {c.name: c.trajectory for c in comparisons}
+    plots = [_plot("error_path", _error_path(truth, comparisons, world))]
+    plots.append(_plot("positions", _values(truth, estimates, POSITIONS)))
+    if not all(each.has_rotations for each in (truth, *estimates.values())):
+        return [*plots, *not_drawn(["angles"], "there are positions without rotations")]
+    # an axis of the world points up, whichever it is
+    R_flu_world = _FLU_CAMERA if world.is_up_negative else np.eye(3)
+
+    def angles(trajectory: Trajectory) -> FloatArray:
+        R = R_flu_world @ trajectory.T_world_frame[:, :3, :3] @ R_flu_world.T
+        euler = np.asarray(Rotation.from_matrix(R).as_euler("xyz"))
+        return np.rad2deg(np.unwrap(euler, axis=0))
+
+    return [*plots, _plot("angles", _values(truth, estimates, ANGLES, angles))]
+
+
+def _values(truth: Trajectory, estimates: dict[str, Trajectory], *what: Any) -> Figure:  # noqa: ANN401
+    figure = new_figure(3 * _ROW_HEIGHT)
+    panels = figure.subplots(3, 1, sharex=True)
+    draw_values(panels, truth, estimates, *what)
+    legend_above(figure, panels[0])
+    return figure
+
+
+def _error_path(truth: Trajectory, comparisons: Sequence[Comparison], world: World) -> Figure:
+    n, n_columns = len(comparisons), min(len(comparisons), 2)
+    n_rows = -(-n // n_columns)
+    figure = new_figure(_PATH_HEIGHT * n_rows)
+    panels = [figure.add_subplot(n_rows, n_columns, number) for number in range(1, n + 1)]
+    largest_m = max(float(c.errors_m.max()) for c in comparisons)
+    for axes, c in zip(panels, comparisons, strict=True):
+        axes.plot(*truth.positions[:, world.ground].T, color="black", ls="--", lw=0.7)
+        points = c.estimate.positions[:, world.ground]
+        looks: dict[str, Any] = {"cmap": "viridis", "clim": (0.0, largest_m), "linewidths": 2.5}
+        drawn = draw_segments(axes, points[:-1], points[1:], array=c.errors_m[1:], **looks)
+        axes.set_title(plain(c.name), loc="left")
+        axes.set(xlabel=f"{'xyz'[world.ground[0]]} [m]", ylabel=f"{'xyz'[world.ground[1]]} [m]")
+        axes.set_aspect("equal", adjustable="datalim")
+    figure.colorbar(drawn, ax=panels, label="position error [m]")
+    return figure
 
 
 def error_plots(comparisons: Sequence[Comparison], align: AlignMode) -> list[Plot]:
@@ -124,8 +178,9 @@ def drift_plot(
     comparisons: Sequence[Comparison], *, asked_m: Sequence[float] | None = None
 ) -> Plot:
     """Return the drift by the length of segments."""
-    path_m = max(float(c.reference.distances()[-1]) for c in comparisons)
-    is_asked = asked_m is not None and tuple(asked_m) not in (KITTI_SEGMENTS_M, SHORT_SEGMENTS_M)
+    longest = max((c.reference for c in comparisons), key=lambda path: path.distances()[-1])
+    path_m = float(longest.distances()[-1])
+    is_asked = asked_m is not None and tuple(asked_m) != usual_segments(longest)[0]
     lengths = tuple(asked_m) if asked_m is not None and is_asked else drift_lengths(path_m)
     found = [(c.name, drift(c, lengths)) for c in comparisons]
     n_segments = next((int(item.n_segments[-1]) for _, item in found if item is not None), None)

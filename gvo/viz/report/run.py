@@ -12,14 +12,13 @@ import numpy as np
 from gvo._text import number_text
 from gvo.config import Config
 from gvo.errors import TrajectoryError
-from gvo.frontend.offsets import describe_offsets
 from gvo.io.run_folder.reader import RunRecord, Table, loop_ends
 from gvo.io.run_folder.verdict import loop_words, verdict
 from gvo.trajectory.alignment import AlignMode
 from gvo.trajectory.evaluation import Evaluation, consistency, evaluation_table, motions_of_chain
 from gvo.trajectory.trajectory import Trajectory
 from gvo.viz.figures import Plot, elapsed, evenly, style, write_plots
-from gvo.viz.measures import Comparison, compare
+from gvo.viz.measures import Comparison, compare, truth_around
 from gvo.viz.pages import changes, write_page
 from gvo.viz.report.paths import (
     TITLES,
@@ -37,6 +36,7 @@ from gvo.viz.report.plots import (
     edge_plots,
     error_plots,
     not_drawn,
+    pose_plots,
     status_plot,
     timing_plot,
 )
@@ -91,7 +91,8 @@ def write_comparison_report(
     facts = {"Estimates": names, "Poses of the reference": str(len(truth)), "Alignment": align}
     with style():
         lines = lines_of(shown, {c.name: c.trajectory for c in compared})
-        drawn = path_plots(lines, world) + error_plots(compared, align)
+        drawn = path_plots(lines, world) + pose_plots(shown, compared, world)
+        drawn += error_plots(compared, align)
         drawn.append(drift_plot(compared, asked_m=asked_m))
         if path is not None:
             header, rows = evaluation_table(evaluations)
@@ -106,13 +107,6 @@ def write_comparison_report(
             )
         if plots is not None:
             write_plots(drawn, Path(plots))
-
-
-def truth_around(truth: Trajectory, parts: Sequence[Trajectory]) -> Trajectory:
-    """Return the ground truth within the span of the associated poses."""
-    first_ns = min(int(part.stamps_ns[0]) for part in parts)
-    last_ns = max(int(part.stamps_ns[-1]) for part in parts)
-    return truth.select((truth.stamps_ns >= first_ns) & (truth.stamps_ns <= last_ns))
 
 
 def write_run_report(
@@ -274,7 +268,6 @@ def _facts(record: RunRecord) -> dict[str, str]:
         "Segments": _segment_words(summary.get("segments", ())),
         "Status": ", ".join(f"{n} {status}" for status, n in statuses.items()),
         "Ground truth": str(summary.get("ground_truth", "")),
-        "Learnt calibration errors": describe_offsets(summary.get("rig_offsets")),
         "Median per frame": _median_words(summary.get("median_ms")),
         "Peak memory": "" if memory is None else f"{float(memory):.0f} MB",
         "Version": "" if version is None else f"gvo {version}",

@@ -39,7 +39,7 @@ def test_json_holds_every_finding_and_no_nan(result: CheckResult) -> None:
 
 
 @given(RESULTS)
-def test_the_table_has_a_line_per_finding_and_aligned_columns(result: CheckResult) -> None:
+def test_the_table_has_an_entry_per_finding_and_names_the_worst(result: CheckResult) -> None:
     n_told = next((n for n, f in enumerate(result.findings) if f.verdict != "info"), None)
     told = result.findings[:n_told]
     text = format_check(result)
@@ -47,13 +47,31 @@ def test_the_table_has_a_line_per_finding_and_aligned_columns(result: CheckResul
     lines = text.splitlines()
     assert lines[: len(told)] == [finding.value_text for finding in told]
     header, *rows, last = lines[len(told) :]
+    assert header.split() == ["verdict", "check", "value", "[threshold]"]
+    entries = [row.split(maxsplit=2) for row in rows if not row.startswith(" ")]
+    shown = result.findings[len(told) :]
+    assert [entry[:2] for entry in entries] == [[f.verdict, f.name] for f in shown]
+    assert [row.strip() for row in rows if row.startswith(" ")] == [f.fix for f in shown]
+    worst = [*result.with_verdict("fault"), *result.with_verdict("warning")]
     assert last.startswith(result.recording)
-    column = header.index("verdict")
-    for row, finding in zip(rows, result.findings[len(told) :], strict=True):
-        assert row.startswith(finding.name)
-        if finding.verdict != "info":
-            assert row[column:].startswith(finding.verdict)
-        assert row.endswith(finding.fix)
+    assert last.endswith(f"look first at {worst[0].name}" if worst else ": healthy")
+
+
+def test_lines_fit_a_terminal_and_no_word_nor_threshold_is_broken() -> None:
+    finding = Finding(
+        name="colour/depth: frames without partner",
+        value="14 of 120 at sync.max_difference_ms=20 and so on and on",
+        threshold="<= 5 %",
+        verdict="warning",
+        fix=" ".join(["images-of-one-stream"] * 8),
+    )
+    lines = format_check(CheckResult(recording="drive", findings=(finding,))).splitlines()[1:-1]
+    assert [line.strip() for line in lines] == [
+        "warning  colour/depth: frames without partner  14 of 120 at",
+        "sync.max_difference_ms=20 and so on and",
+        "on [<= 5 %]",
+        *[" ".join(["images-of-one-stream"] * n) for n in (3, 3, 2)],
+    ]
 
 
 def test_a_number_is_judged_by_its_rule_and_only_what_is_wrong_has_a_fix() -> None:

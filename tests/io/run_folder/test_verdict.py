@@ -51,7 +51,7 @@ CLOSED = [
 LOOK = "frames.csv, which says why frames are not tracked"
 LEARNT = "(learnt and corrected)"
 CASES = [
-    (summary(), "298 m in 393 frames, all tracked; 0.3 m from the truth; covariances fit."),
+    (summary(), "298 m in 393 frames, all tracked; 0.3 m from the truth. Covariances fit."),
     (without_truth(), "298 m in 393 frames, all tracked; no truth to compare with."),
     (
         without_truth(warnings=["not compared with the ground truth: x"]),
@@ -86,8 +86,8 @@ CASES = [
     # a truth of a part of the frames
     (
         summary(errors=[{"name": "smoothed", "n": 64, "ate_m": 0.0039, "rpe_m": None}]),
-        "298 m in 393 frames, all tracked; 0.0039 m from the truth, known of 64 frames; "
-        "covariances fit.",
+        "298 m in 393 frames, all tracked; 0.0039 m from the truth, known of 64 frames. "
+        "Covariances fit.",
     ),
     # global poses are the best where loops were closed, and else as good as the smoothed ones
     (
@@ -102,7 +102,20 @@ def test_the_verdict_says_how_far_and_how_good(told: dict[str, Any], words: str)
     assert verdict(told) == words
 
 
-FIT = "covariances fit"
+def test_causes_come_before_looks_and_covariances() -> None:
+    error = {"name": "smoothed", "n": 393, "ate_m": 9.0, "scale": 0.5, "scaled_ate_m": 0.2}
+    error["jumps"] = [[7, 2_500_000_000, 4.0], [9, 3_000_000_000, 0.1]]
+    offsets = {"readout_ms": 20.9, "readout_sigma_ms": 1.3}
+    said = verdict(summary(sensor="rgbd", errors=[error], rig_offsets=offsets))
+    assert said == (
+        "298 m in 393 frames, all tracked; 9 m from the truth. Likely cause: the scale, the path "
+        "is 2 times as long as the true one (is depth.scale right? times 0.5, errors fall to "
+        "0.2 m); a jump of 4 m at frame 7 (2.500 s). Worth a look: a rolling shutter, rows are "
+        f"read out over 21 ms {LEARNT}. Covariances fit."
+    )
+
+
+FIT = "fit"
 
 
 @pytest.mark.parametrize(
@@ -111,16 +124,16 @@ FIT = "covariances fit"
         (row(1.0), FIT),
         (row(3.9), FIT),  # within a factor of two in sigma
         (row(0.26), FIT),
-        (row(0.04), "covariances too large, 5 times in sigma"),
+        (row(0.04), "are too large, 5 times in sigma"),
         (
             row(324.0, error_m=0.091),
-            "covariances too small, 18 times in sigma, unless the truth itself is off by 0.091 m "
+            "are too small, 18 times in sigma, unless the truth itself is off by 0.091 m "
             "and 0.1 deg over 1 s",
         ),
         # the error over a second is hardly larger than what the truth jumps by between frames
         (
             row(25.0, error_m=0.006),
-            "covariances cannot be judged, the truth jumps by 0.004 m between frames",
+            "cannot be judged, the truth jumps by 0.004 m between frames",
         ),
         # of so few motions chance makes more
         (row(5.0) | {"nees_high": 6.0}, FIT),
@@ -129,7 +142,7 @@ FIT = "covariances fit"
 )
 def test_the_verdict_judges_the_covariances(found: dict[str, Any], words: str) -> None:
     said = verdict(summary(covariances=[found]))
-    assert said == f"298 m in 393 frames, all tracked; 0.3 m from the truth; {words}."
+    assert said == f"298 m in 393 frames, all tracked; 0.3 m from the truth. Covariances {words}."
 
 
 @pytest.mark.parametrize(
@@ -160,7 +173,8 @@ def test_the_verdict_judges_the_covariances(found: dict[str, Any], words: str) -
 def test_the_verdict_names_what_was_learnt(offsets: dict[str, Any], looks: list[str]) -> None:
     said = verdict(summary(rig_offsets=offsets))
     text = "; ".join(f"{look} {LEARNT}" for look in looks)
-    assert said.partition(FIT)[2] == (f". Worth a look: {text}." if looks else ".")
+    after = said.partition(" from the truth.")[2]
+    assert after == (f" Worth a look: {text}. Covariances fit." if looks else " Covariances fit.")
 
 
 SAME = "global is smoothed"
