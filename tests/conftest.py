@@ -194,8 +194,10 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 
     def run(*arguments: object) -> Answer:
         monkeypatch.setattr("sys.argv", ["gvo", *map(str, arguments)])
+        monkeypatch.setattr(gvo.GvoError, "names_flags", False)  # the command sets it itself
         with pytest.raises(SystemExit) as exit_info:
             main()
+        monkeypatch.setattr(gvo.GvoError, "names_flags", True)
         captured = capsys.readouterr()
         code = exit_info.value.code
         return Answer(code if isinstance(code, int) else 0, captured.out, captured.err)
