@@ -96,15 +96,17 @@ def _find_info(reader: MessageReader, image: Topic, infos: Sequence[Topic]) -> T
     frame_id, size = "", (0, 0)
     with suppress(CalibrationError, RecordingError):  # as of a network, before the first image
         frame_id, size = image_frame(reader, image), image_size(reader, image)
-    best, found = 0, None
-    for topic, is_near in camera_info_topics(image, infos):
+    best, found, of_name = 0, None, None
+    for by_name, topic in camera_info_topics(image, infos):
         its_size, its_frame = _stated(reader, topic)
         is_other_size = size != its_size and 0 not in (*size, *its_size)
         is_other = is_other_size or (frame_id != its_frame and "" not in (frame_id, its_frame))
         is_its_own = size == its_size and frame_id == its_frame != ""
-        rank = (1 if is_other else 3) if is_near else 2 * is_its_own
+        rank = 2 * is_its_own if by_name[0] else 1 if is_other else 3
         if rank > best:
-            best, found = rank, topic
+            best, found, of_name = rank, topic, by_name
+        elif rank == best == 2 and by_name == of_name:
+            found = None  # nothing tells which
         if best == 3:
             break
     return found

@@ -23,23 +23,22 @@ _SIDES = (
     *((f"{name}1", f"{name}2") for name in ("infra", "fisheye")),
 )
 _COLOR = re.compile(r"rgb|colou?r")
-# Where no name says colour: grey images with depth.
-_GREY = re.compile(r"left|gr[ae]y|mono|infra1")
-# Depth, or colour seen from the depth camera: `rgb_to_depth`.
-_NO_COLOR = re.compile(r"compressedDepth|_to_depth")
+# Depth, colour seen from the depth camera (`rgb_to_depth`), or both images of a ZED in one.
+_NO_COLOR = re.compile(r"compressedDepth|_to_depth|/stereo(_raw)?/(image_r\w+_|color/r)")
 _DEPTH = re.compile(r"(?<!_to_)depth")
 # Where no name says depth: that of an OAK.
 _DEPTH_OR_STEREO = re.compile(rf"{_DEPTH.pattern}|(?<![a-z])stereo/image_raw$")
 # Not to another camera than the colour one: `aligned_depth_to_infra1`.
 _REGISTERED = re.compile(r"(?<!un)(aligned|registered)(?!\w*_to_(?!rgb|colou?r))|_to_(rgb|colou?r)")
 # Of the pixels of the camera as it is, not of the rectified ones.
-_RAW_DEPTH = re.compile(r"depth.*(/image|raw)$")
+_RAW_DEPTH = re.compile(r"depth.*raw$")
 # at the start of a word: not in "unrectified" or "direct"
 _RECTIFIED = re.compile(r"(?<![a-z])rect")
 # How the images of one camera differ in name: not in the middle, as `camera_gray_left`.
 _SORTS = re.compile(
     r"(?:(?<=/)|_|^)(raw|rect(ified)?)(?=[/_]|$)|(?:(?<=/)|_)(colou?r|mono|gr[ae]y)(?=/|$)"
 )
+_SIDE = re.compile(r"left|right")
 _WORD = re.compile(r"[a-z]+|\d+")
 # What the names of all topics of `CameraInfo` hold.
 _OF_INFOS = {"camera", "cam", "info"}
@@ -113,7 +112,7 @@ def choose_topics(topics: Sequence[Topic], choice: TopicChoice, where: str) -> C
     """Choose the image topics of one camera.
 
     A stereo pair is two topics that differ in left and right, image_0 and image_1, or the like;
-    an RGB-D camera is one with rgb or colour (else grey) in its name and one with depth. Of the
+    an RGB-D camera is one with rgb or colour (else any) in its name and one with depth. Of the
     topics of one camera, rectified ones are taken before raw ones, and these before compressed
     ones; with depth of raw pixels raw ones. Where the user chose one topic, its partner is found.
 
@@ -150,28 +149,30 @@ def choose_topics(topics: Sequence[Topic], choice: TopicChoice, where: str) -> C
     raise RecordingError(_explain(where, images, candidates))
 
 
-def camera_info_topics(image: Topic, infos: Iterable[Topic]) -> list[tuple[Topic, bool]]:
-    """Return the topics of `CameraInfo` that may be of an image topic, best first.
+def camera_info_topics(image: Topic, infos: Iterable[Topic]) -> list[tuple[_Score, Topic]]:
+    """Return the topics of `CameraInfo` that may be of an image topic, by rank, best first.
 
     First those by their place, beside the image topic, below it, or beside or below its namespace,
-    whose name says nothing that the image's does not: with True. Then those anywhere that do not
-    contradict it, as raw ones do rectified images and right ones left images.
+    whose name says nothing that the image's does not. Then, of ranks that begin with one, those
+    anywhere that do not contradict it, as raw ones do rectified images, right ones left images,
+    and other numbers.
     """
     parent = image.base.rpartition("/")[0]
     grandparent = parent.rpartition("/")[0]
     places = [parent, image.base, grandparent, f"{grandparent}/info".strip("/")]
     words = {*_WORD.findall(image.base.lower())}
     against = {"left", "right", "rect", "rectified", "raw" if image.is_rectified else "rect"}
-    found: list[tuple[int, int, int, Topic]] = []
+    found = []
     for topic in infos:
         said = {*_WORD.findall(topic.base.lower())} - _OF_INFOS
         place = topic.base.rpartition("/")[0]
         is_near = place in places and said <= words
-        if is_near or not (said - words) & against:
+        numbers = [any(map(str.isdigit, each)) for each in (said - words, words - said)]
+        if is_near or not ((said - words) & against or all(numbers)):
             rank = places.index(place) if is_near else len(places)
-            found.append((rank, -_n_common_parts(image, topic), -len(said & words), topic))
-    found.sort(key=lambda each: each[:3])
-    return [(topic, rank < len(places)) for rank, *_, topic in found]
+            n_common, n_said = _n_common_parts(image, topic), len(said & words)
+            found.append(((not is_near, rank, -n_common, -n_said), topic))
+    return sorted(found, key=lambda each: each[0])
 
 
 def find_topic(name: str, topics: Iterable[Topic]) -> Topic | None:
@@ -235,13 +236,12 @@ def _rgbd_pairs(images: Sequence[Topic], *, is_found: bool = True) -> Iterator[C
     depths = [topic for topic in usable.values() if words.search(topic.base.lower())]
     others = [t for t in usable.values() if t not in depths and not _NO_COLOR.search(t.name)]
     colors = [topic for topic in others if _COLOR.search(topic.base.lower())]
-    if not (colors or is_found):
-        colors = [topic for topic in others if _GREY.search(topic.base.lower())]
-    for color in colors:
+    for color in colors if colors or is_found else others:
         # the depth of a stereo camera is that of its left one
         is_right = any(name in usable for name in _other_side(color.name.lower(), "right", "left"))
         for depth in depths:
-            if not is_right or "right" in depth.name.lower():
+            is_beside = is_found or _n_common_parts(color, depth) > 0
+            if is_beside and (not is_right or "right" in depth.name.lower()):
                 yield CameraTopics(sensor="rgbd", first=color, second=depth)
 
 
@@ -261,7 +261,7 @@ def _camera_name(pair: CameraTopics) -> str:
     parts = [part for part in place.split("/") if part]
     if pair.sensor == "rgbd":
         parts = parts[: next((i for i, part in enumerate(parts) if _COLOR.search(part)), None)]
-        if "left" not in pair.second.base.lower():
+        if not _SIDE.search(pair.second.base.lower()):
             parts = [part for part in parts if part != "left"]
     return "/".join(parts)
 

@@ -288,10 +288,17 @@ _SEEN = ("eye", (48, 32))
             "/s/left_camera_info",
         ),
         ("/s/left/image", {"/s/right/camera_info": _SEEN}, None),
+        ("/cam1/image", {"/cam0/camera_info": _SEEN}, None),
         ("/s/left/image", {"/infos/right": _SEEN, "/infos/left": _SEEN}, "/infos/left"),
         # elsewhere, with the size and the frame of the images
         ("/cam/image_raw", {"/cam/camera_info_0": _SEEN}, "/cam/camera_info_0"),
         ("/cam/image_raw", {"/cam/camera_info_0": ("other", (48, 32))}, None),
+        ("/cam/image_raw", {"/cam/camera_info_0": _SEEN, "/cam/camera_info_1": _SEEN}, None),
+        (
+            "/cam/image_raw",
+            {"/x/camera_info": _SEEN, "/cam/b/camera_info": _SEEN},
+            "/cam/b/camera_info",
+        ),
         ("/cam/image_raw", {"/cam/camera_info_0": ("eye", (96, 64))}, None),
         (
             "/cam/image_raw",

@@ -115,6 +115,8 @@ _DRIVERS = {
             "/zed/zed_node/depth/depth_registered",
             "/zed/zed_node/left_raw/image_raw_color",
             "/zed/zed_node/left/image_rect_color",
+            "/zed/zed_node/stereo/image_rect_color",
+            "/zed/zed_node/stereo_raw/image_raw_color",
         ],
         (
             "rgbd",
@@ -163,6 +165,10 @@ _DRIVERS = {
         ["/camera/infra1/image_rect_raw", "/camera/depth/image_rect_raw"],
         ("rgbd", "/camera/infra1/image_rect_raw", "/camera/depth/image_rect_raw"),
     ),
+    "Gazebo": (
+        ["/camera/image_raw", "/camera/depth/image_raw"],
+        ("rgbd", "/camera/image_raw", "/camera/depth/image_raw"),
+    ),
     "Azure Kinect": (
         [
             "/rgb/image_raw",
@@ -198,6 +204,13 @@ _DRIVERS = {
         [f"/camera/rgb/image_{kind}" for kind in ("raw", "mono", "color", "rect_color")]
         + ["/camera/depth/image_raw", "/camera/depth_registered/image_raw"],
         ("rgbd", "/camera/rgb/image_(raw|mono|color)", "/camera/depth_registered/image_raw"),
+    ),
+    "Kinect, in metres": (
+        [
+            *(f"/camera/rgb/image_{kind}" for kind in ("raw", "rect_color")),
+            "/camera/depth_registered/image",
+        ],
+        ("rgbd", "/camera/rgb/image_rect_color", "/camera/depth_registered/image"),
     ),
     "Kinect, registered by software": (
         [f"/camera/rgb/image_{kind}" for kind in ("raw", "color", "rect_color")]
@@ -265,6 +278,17 @@ def test_two_cameras_are_refused_with_what_to_type() -> None:
         assert flags in str(caught.value)
     assert _choose(topics, left="/b/left/image") == ("stereo", "/b/left/image", "/b/right/image")
     assert _choose(topics, right="a/right/image")[1] == "/a/left/image"
+
+
+def test_depth_goes_with_colour_of_its_own_side() -> None:
+    topics = _topics(
+        *(f"/{side}/{name}" for side in ("left", "right") for name in ("rgb", "depth"))
+    )
+    with pytest.raises(RecordingError, match="more than one camera") as caught:
+        _choose(topics)
+    assert "--color /left/rgb --depth /left/depth" in str(caught.value)
+    assert "--color /left/rgb --depth /right/depth" not in str(caught.value)
+    assert _choose(topics, color="/right/rgb") == ("rgbd", "/right/rgb", "/right/depth")
 
 
 def test_any_two_topics_can_be_named() -> None:
