@@ -298,5 +298,5 @@ def _draw(folder: Path, *, plots: Path | None) -> None:
     from gvo.viz.report import write_run_report
 
     record = read_run(folder)
-    plot_trajectories(folder / PICTURE, record.truth, record.comparable())
+    plot_trajectories(folder / PICTURE, record.truth, record.comparable(), loops=record.loops)
     write_run_report(folder / REPORT, record, plots=plots)

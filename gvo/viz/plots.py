@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gvo.io.run_folder.reader import Table
 from gvo.trajectory.alignment import AlignMode
 from gvo.trajectory.trajectory import Trajectory
 from gvo.viz.names import check_suffix
@@ -25,6 +26,7 @@ def plot_trajectories(
     estimates: Mapping[str, Trajectory],
     *,
     align: AlignMode = "se3",
+    loops: Table | None = None,
 ) -> Figure:
     """Draw trajectories from above, and their errors (or positions) over time.
 
@@ -40,6 +42,9 @@ def plot_trajectories(
         By name, at least one; "raw", "causal", "smoothed" and "global" have fixed colours.
     align : {"none", "origin", "se3", "sim3"}
         Alignment of each estimate with the reference.
+    loops : mapping of str to ndarray, optional
+        Columns `stamp_ns`, `reference_ns` and `reason` of a run's `loops.csv`: those that count
+        are marked on the last estimate, where there is a reference.
 
     Returns
     -------
@@ -67,7 +72,7 @@ def plot_trajectories(
         if reference is None:
             figure = figure_of_positions(estimates)
         else:
-            figure = figure_of_errors(reference, estimates, align)
+            figure = figure_of_errors(reference, estimates, align, loops)
         if path is not None:
             save_figure(figure, path)
     return figure

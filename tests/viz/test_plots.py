@@ -128,3 +128,18 @@ def test_the_plane_of_positions_is_that_of_their_motion(tmp_path: Path) -> None:
     }
     assert axes == {"camera": ["x", "z"], "points": ["x", "y"]}
     assert "raw (ATE" in svg_text(tmp_path, points, {"raw": path})
+
+
+def test_small_errors_are_in_millimetres_and_loops_that_count_are_marked(tmp_path: Path) -> None:
+    truth = curve(0)
+    ends = truth.stamps_ns[[-1, -2, -3]], truth.stamps_ns[[0, 1, 2]]
+    reasons = np.array(["", "", "too far"], dtype=object)
+    loops = {"stamp_ns": ends[0], "reference_ns": ends[1], "reason": reasons}
+    text = svg_text(tmp_path, truth, {"raw": truth.moved(np.eye(4))}, align="none", loops=loops)
+    assert "loops (2)" in text
+    assert "position error [mm]" in text
+    far = np.eye(4)
+    far[0, 3] = 3.0
+    text = svg_text(tmp_path, truth, {"raw": truth.moved(far)}, align="none")
+    assert "loops" not in text
+    assert "raw (ATE 3 m)" in text

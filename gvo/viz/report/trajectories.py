@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from gvo.io.run_folder.reader import Table, loop_ends
 from gvo.trajectory.alignment import AlignMode
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
@@ -14,7 +15,7 @@ from gvo.viz.figures import draw_curve, elapsed, legend_below, new_figure
 from gvo.viz.measures import compare, truth_around
 from gvo.viz.palette import REFERENCE_STYLE, styles_of
 from gvo.viz.plots import ground_plane
-from gvo.viz.report.paths import Line, draw_lines, lines_of
+from gvo.viz.report.paths import Line, draw_lines, lines_of, loop_lines
 
 _HEIGHT_INCHES = 5.5
 POSITIONS = ("x [m]", "y [m]", "z [m]")
@@ -22,20 +23,27 @@ ANGLES = ("roll [deg]", "pitch [deg]", "yaw [deg]")
 
 
 def figure_of_errors(
-    reference: Trajectory, estimates: Mapping[str, Trajectory], align: AlignMode
+    reference: Trajectory,
+    estimates: Mapping[str, Trajectory],
+    align: AlignMode,
+    loops: Table | None = None,
 ) -> Figure:
-    """Draw estimates aligned with a reference, and their errors."""
+    """Draw estimates aligned with a reference, their errors, and the loops of the last one."""
     compared = [compare(reference, e, name=name, align=align) for name, e in estimates.items()]
     shown = truth_around(reference, [c.reference for c in compared])
     figure = new_figure(_HEIGHT_INCHES)
     view, errors = figure.subplots(1, 2)
-    labelled = {f"{c.name} (ATE {c.ate_m:.3g} m)": c.trajectory for c in compared}
+    largest_m = max(float(c.errors_m.max()) for c in compared)
+    unit, scale = ("mm", 1e3) if largest_m < 1.0 else ("m", 1.0)
+    labelled = {f"{c.name} (ATE {scale * c.ate_m:.3g} {unit})": c.trajectory for c in compared}
     lines = lines_of(shown, labelled)
-    _draw_view(view, figure, lines, reference)
+    ends = {} if loops is None else loop_ends(loops, compared[-1].trajectory)
+    marks = loop_lines({name: ends[name] for name in ends if name == "loops"})
+    _draw_view(view, figure, [*lines, *marks], reference)
     for c, line in zip(compared, lines[1:], strict=True):
         elapsed_s = elapsed(c.reference.stamps_ns, int(shown.stamps_ns[0]))
-        draw_curve(errors, elapsed_s, c.errors_m, line.style)
-    words = f"position error [m], alignment: {align}"
+        draw_curve(errors, elapsed_s, scale * c.errors_m, line.style)
+    words = f"position error [{unit}], alignment: {align}"
     errors.set(xlabel=stamp_label(shown), ylabel=words, ylim=(0.0, None))
     return figure
 
