@@ -199,7 +199,7 @@ class KltFrontend:
         rough = self._register_step(prior, reference, current, "wide")
         if prior is None and not isinstance(rough, RelativePose | Contradiction):
             places = self.describe(reference), self.describe(current)
-            rough = self._register_places(*places) or rough
+            rough = self.register_places(*places) or rough
         if isinstance(rough, Failure):
             return rough
         found = MotionPrior(T_predicted=rough.T_reference_current)
@@ -258,7 +258,7 @@ class KltFrontend:
         -------
         RelativePose or Failure
         """
-        rough = self._register_places(reference, current)
+        rough = self.register_places(reference, current)
         if isinstance(rough, Failure):
             return rough
         prior = MotionPrior(T_predicted=rough.T_reference_current)
@@ -284,7 +284,7 @@ class KltFrontend:
             return check_view(result, reference.points_cam, self.camera, depths_agree=True)
         return checked
 
-    def _register_places(self, reference: KltPlace, current: KltPlace) -> RelativePose | Failure:
+    def register_places(self, reference: KltPlace, current: KltPlace) -> RelativePose | Failure:
         """Register by descriptors, which match corners that moved too far for a track."""
         first, second = (self._as_observations(place) for place in (reference, current))
         matches = match_anywhere(reference.descriptors, current.descriptors)

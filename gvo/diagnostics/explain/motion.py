@@ -37,8 +37,9 @@ class Asked(NamedTuple):
     result: RelativePose | Failure
 
 
-# Where the search for points began, whether it was wide, and what it found.
-_Attempt: TypeAlias = tuple[MotionPrior | None, bool, Measurements]
+# Where the search for points began, whether it was wide, what it found, and where in words.
+_Attempt: TypeAlias = tuple[MotionPrior | None, bool, Measurements, str]
+_BY_MOTION, _BY_DESCRIPTORS = "predicted pixels", "pixels that descriptors predict"
 
 
 def explain_registration(frontend: OwnFrontend, asked: Asked, config: Config) -> Registration:
@@ -47,7 +48,7 @@ def explain_registration(frontend: OwnFrontend, asked: Asked, config: Config) ->
     The same arguments give the same result, so what is shown is what happened.
     """
     attempts = list(_attempts(frontend, asked, config))
-    prior, is_wide, measured = attempts[-1]
+    prior, is_wide, measured, _ = attempts[-1]
     start = prior
     if isinstance(frontend, KltFrontend):
         radius_px = float(WINDOW_RADIUS_PX)
@@ -73,30 +74,32 @@ def _attempts(frontend: OwnFrontend, asked: Asked, config: Config) -> Iterator[_
         ways.insert(0, (asked.prior, False))
     for prior, is_wide in ways:
         measured = frontend.measure(*given, prior, is_wide=is_wide)
-        yield prior, is_wide, measured
+        yield prior, is_wide, measured, "previous pixels" if prior is None else _BY_MOTION
         if _is_end(measured, asked.result):
             return
-    start = None if isinstance(frontend, KltFrontend) else asked.prior
-    step = isinstance(frontend, KltFrontend) or is_step(asked.prior)
-    rough = frontend.calibrated.register(measured, config, prior=start, is_step=step)
-    # Descriptors of the whole image may have found it, too; their motion is near the result.
-    known = rough or asked.result
-    if isinstance(known, RelativePose):
-        found = MotionPrior(T_predicted=known.T_reference_current)
-        yield found, False, frontend.measure(*given, found, is_wide=False)
+    if not isinstance(frontend, KltFrontend):
+        return  # its wide search is the last one
+    rough = frontend.calibrated.register(measured, config, prior=None, is_step=True)
+    place = _BY_MOTION
+    if asked.prior is None and not isinstance(rough, RelativePose | Contradiction):
+        rough = frontend.register_places(*map(frontend.describe, given))
+        place = _BY_DESCRIPTORS
+    if isinstance(rough, RelativePose):
+        found = MotionPrior(T_predicted=rough.T_reference_current)
+        yield found, False, frontend.measure(*given, found, is_wide=False), place
 
 
 def _describe(attempts: list[_Attempt], result: RelativePose | Failure) -> Iterator[str]:
     """Yield how each attempt searched, and what came of it."""
-    for number, (prior, is_wide, _) in enumerate(attempts, start=1):
-        where = f"around the {'previous' if prior is None else 'predicted'} pixels"
+    for number, (_, is_wide, _, place) in enumerate(attempts, start=1):
         if number < len(attempts):
-            answer = "its motion predicts the next attempt" if is_wide else "not registered"
+            is_start = is_wide and attempts[number][3] == _BY_MOTION
+            answer = "its motion predicts the next attempt" if is_start else "not registered"
         elif isinstance(result, Failure):
             answer = result.reason
         else:
             answer = f"registered, {result.n_inliers} inliers of {result.n_matches} matches"
-        yield f"{'wide' if is_wide else 'near'} search {where}: {answer}"
+        yield f"{'wide' if is_wide else 'near'} search around the {place}: {answer}"
 
 
 def _is_end(measured: Measurements, result: RelativePose | Failure) -> bool:
@@ -106,7 +109,7 @@ def _is_end(measured: Measurements, result: RelativePose | Failure) -> bool:
 
 
 def _sort_tracks(frontend: KltFrontend, asked: Asked, attempt: _Attempt) -> Sorting:
-    prior, is_wide, measured = attempt
+    prior, is_wide, measured, _ = attempt
     T = np.eye(4) if prior is None else prior.T_predicted
     expected = frontend.predict(T, asked.reference, asked.current)
     search: Literal["wide", "near"] = "wide" if is_wide else "near"
@@ -127,7 +130,7 @@ def _sort_tracks(frontend: KltFrontend, asked: Asked, attempt: _Attempt) -> Sort
 def _sort_descriptors(
     frontend: OwnFrontend, asked: Asked, attempt: _Attempt, radius_px: float, config: Config
 ) -> Sorting:
-    prior, _, measured = attempt
+    prior, _, measured, _ = attempt
     reference, current, matches = asked.reference, asked.current, measured.matches
     T = None if prior is None else prior.T_predicted
     expected = predict_pixels(reference, T, frontend.camera)

@@ -181,3 +181,22 @@ def test_a_frame_not_there_is_refused_in_one_line(
     with pytest.raises(kind, match=words) as error:
         explain_frame(source, index)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "every", "first", "place"),
+    [
+        ("stereo", 14, "its motion predicts the next attempt", "predicted pixels"),
+        ("rgbd", 25, "not registered", "pixels that descriptors predict"),
+    ],
+)
+def test_only_a_search_that_found_a_motion_is_said_to_predict_the_next(
+    sensor: Sensor, every: int, first: str, place: str
+) -> None:
+    turning = SyntheticRecording("turning", sensor, n_frames=2 * every, scale=0.5)
+    found = explain_frame(turning, 1, excerpt=gvo.Excerpt(every=every)).registration
+    assert found is not None
+    assert found.attempts[0] == f"wide search around the previous pixels: {first}"
+    assert found.attempts[1].startswith(f"near search around the {place}: registered, ")
+    assert len(found.attempts) == 2
+    assert len(found.inliers) == found.matches.are_kept.sum()
