@@ -57,7 +57,9 @@ def live(
     ] = None,
     world: Annotated[str, Option(metavar="NAME", help="Name of the fixed frame sent.")] = "map",
     with_tf: Annotated[bool, Option("--tf/--no-tf", help="Send transforms.")] = True,
-    qos: Annotated[_Qos, Option(help="How to receive images from ROS 2.")] = "sensor",
+    qos: Annotated[
+        _Qos, Option(metavar="QOS", help="QoS of ROS 2 images: sensor, reliable, system.")
+    ] = "sensor",
     foxglove: Annotated[
         str | None, Option(metavar="[HOST:]PORT", help="Serve Foxglove at this port.")
     ] = None,

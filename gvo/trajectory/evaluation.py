@@ -30,8 +30,8 @@ N_DOF = 6
 """Degrees of freedom of a pose and of an edge."""
 
 _MIN_PATH_M = 1e-6
-# A step stands out where its error is so many times that of nearly all others.
-_JUMP_FACTOR, _JUMP_QUANTILE, _N_JUMPS = 5.0, 0.9, 3
+# A step stands out where its error is so many times that of three in four.
+_JUMP_FACTOR, _JUMP_QUANTILE, _N_JUMPS = 6.0, 0.75, 3
 _MIN_POSES = 3  # a rigid transform maps any two positions onto any other two
 SMOOTHED_GLOBAL = "smoothed = global"
 """How both are named where they are the same."""

@@ -344,3 +344,35 @@ def test_without_a_command_all_are_listed(command: Command) -> None:
     answer = command()
     assert answer.code == 2
     assert answer.out == command("-h").out
+
+
+def test_a_terminal_gets_whole_words_and_colours_unless_told_not_to(
+    command: Command, monkeypatch: pytest.MonkeyPatch, here: Path
+) -> None:
+    write_poses(here / "truth.txt")
+    rows = (here / "truth.txt").read_text().split("\n")
+    (here / "a.txt").write_text("\n".join([*rows[:15], "15 300 0 15 0 0 0 1", *rows[16:]]))
+    plain = command("compare", "truth.txt", "a.txt").out
+    cause = plain.splitlines()[-1]
+    assert cause.startswith("a: Likely cause: jumps of ")
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "60")
+    monkeypatch.setenv("NO_COLOR", "1")
+    fitted = command("compare", "truth.txt", "a.txt").out
+    assert fitted.split() == plain.split()
+    assert max(map(len, fitted.splitlines())) <= 60 < len(cause)
+    monkeypatch.delenv("NO_COLOR")
+    coloured = command("compare", "truth.txt", "a.txt").out
+    assert coloured.count("\x1b[31m") == 1
+    assert re.sub(r"\x1b\[\d+m", "", coloured) == fitted
+
+
+def test_a_second_run_into_the_usual_folder_says_so_last(
+    command: Command, room_bag: Path, here: Path
+) -> None:
+    arguments = ["run", room_bag, "--no-report", "--duration", "0.1"]
+    last = [command(*arguments).out.splitlines()[-1] for _ in range(2)]
+    folder = f"gvo-{room_bag.stem}"
+    assert last[0].startswith(f"wrote {folder}: 3 frames in ")
+    assert last[1].startswith(f"wrote {folder}-2: 3 frames in ")
+    assert [line.endswith(f"; {folder} holds an earlier run") for line in last] == [False, True]

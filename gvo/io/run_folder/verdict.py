@@ -56,7 +56,8 @@ def likely_causes(errors: Mapping[str, Any], *, sensor: str = "") -> list[str]:
     jumps = [each for each in errors.get("jumps") or () if each[2] > _JUMP_SHARE * ate_m]
     if jumps:
         words = (f"{error_m:.3g} m at frame {n} ({1e-9 * ns:.3f} s)" for n, ns, error_m in jumps)
-        causes.append(f"{'jumps' if len(jumps) > 1 else 'a jump'} of {', '.join(words)}")
+        kind = "jumps" if len(jumps) > 1 else "a jump"
+        causes.append(f"{kind} of {', '.join(words)} in the estimate or the truth")
     return causes
 
 

@@ -110,8 +110,8 @@ def test_causes_come_before_looks_and_covariances() -> None:
     assert said == (
         "298 m in 393 frames, all tracked; 9 m from the truth. Likely cause: the scale, the path "
         "is 2 times as long as the true one (is depth.scale right? times 0.5, errors fall to "
-        "0.2 m); a jump of 4 m at frame 7 (2.500 s). Worth a look: a rolling shutter, rows are "
-        f"read out over 21 ms {LEARNT}. Covariances fit."
+        "0.2 m); a jump of 4 m at frame 7 (2.500 s) in the estimate or the truth. Worth a look: a "
+        f"rolling shutter, rows are read out over 21 ms {LEARNT}. Covariances fit."
     )
 
 
