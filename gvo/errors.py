@@ -27,7 +27,8 @@ def _in_python(flag: re.Match[str]) -> str:
     setting, name, has_value = flag.groups()
     if name is None:
         return flag[0] if setting is None else f'settings=["{setting}"]'
-    return f"{name.replace('-', '_')}{'=' if has_value else ''}"
+    value = "=True" if name == "force" else "=" if has_value else ""
+    return f"{name.replace('-', '_')}{value}"
 
 
 @contextmanager

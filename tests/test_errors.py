@@ -25,7 +25,6 @@ from gvo.errors import (
         ("give --left TOPIC --right TOPIC (or --depth)", "give left=TOPIC right=TOPIC (or depth)"),
         ("by --out, or --force to replace it", "by out, or force=True to replace it"),
         ("--ground-truth /robot: of base_link", "ground_truth /robot: of base_link"),
-        ("not with --no-report", "not with report=False"),
         ("(--set depth.scale=5000 if right)", '(settings=["depth.scale=5000"] if right)'),
         ("see `gvo config --all`; a--b, /x/--force", "see `gvo config --all`; a--b, /x/--force"),
     ],

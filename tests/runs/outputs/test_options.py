@@ -30,5 +30,5 @@ def test_the_bag_of_a_run_names_the_frames_of_the_recording(walk_bag: Path) -> N
 
 
 def test_plots_without_a_report_are_refused() -> None:
-    with pytest.raises(ConfigurationError, match="--no-report"):
+    with pytest.raises(ConfigurationError, match="--plots are those of the report, which is not"):
         gvo.RunOutputs(report=False, plots=Path("plots"))
