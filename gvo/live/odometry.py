@@ -412,7 +412,7 @@ class WaitingPairs:
     """
 
     def __init__(self, *, max_waiting: int = 10, max_lag_s: float | None = None) -> None:
-        if max_waiting < 1 or (max_lag_s is not None and max_lag_s <= 0.0):
+        if max_waiting < 1 or (max_lag_s is not None and not max_lag_s > 0.0):
             raise ValueError(
                 f"expected max_waiting >= 1 and max_lag_s > 0, got {max_waiting} and {max_lag_s}"
             )

@@ -262,6 +262,8 @@ class Device:
                     yield StampedImage(
                         stream=stream, stamp_ns=stamp_ns, load=load, n_bytes=pixels.nbytes
                     )
+            if not self._is_film:
+                raise RecordingError(f"{self.info.name}: the camera gives no more images")
         finally:
             for capture in self._captures:
                 capture.release()
@@ -272,10 +274,14 @@ class Device:
 
     def _stamp_ns(self, first_ns: int) -> int:
         """Return the time within a video file, or the time of the clock."""
-        capture = self._captures[0]
-        if capture.get(cv2.CAP_PROP_FRAME_COUNT) > 0:
-            return first_ns + round(capture.get(cv2.CAP_PROP_POS_MSEC) * _MILLISECOND_NS)
+        if self._is_film:
+            position_ms = self._captures[0].get(cv2.CAP_PROP_POS_MSEC)
+            return first_ns + round(position_ms * _MILLISECOND_NS)
         return time.time_ns()
+
+    @property
+    def _is_film(self) -> bool:
+        return self._captures[0].get(cv2.CAP_PROP_FRAME_COUNT) > 0
 
     def _retrieve(self) -> list[NDArray[Any]]:
         found = [capture.retrieve() for capture in self._captures]
@@ -289,7 +295,7 @@ class Device:
 
 
 def _opened(name: str) -> cv2.VideoCapture:
-    capture = cv2.VideoCapture(int(name) if name.isdigit() else name)
+    capture = cv2.VideoCapture(int(name) if name.isascii() and name.isdecimal() else name)
     if not capture.isOpened():
         raise RecordingError(f"{name}: OpenCV opens no camera or film by this name")
     return capture

@@ -12,7 +12,7 @@ from typing import Final, TypeVar
 from gvo.config import Config
 from gvo.errors import CalibrationError, RecordingError
 from gvo.io.bag.reader import BagMessage
-from gvo.io.bag.source import BagSource, ImageStamps
+from gvo.io.bag.source import CAMERA_CHANGED, BagSource, ImageStamps
 from gvo.io.bag.topics import (
     CAMERA_INFO_TYPE,
     IMAGE_TYPES,
@@ -55,6 +55,8 @@ class NetworkReader:
         Those that others announce.
     n_dropped : int
         Images that were given up because too many waited to be paired.
+    on_small : callable
+        Gets each `CameraInfo` and transform when it comes.
     """
 
     damage = ""
@@ -64,6 +66,7 @@ class NetworkReader:
         self.topics: list[Topic] = []
         self.notes: list[str] = []
         self.n_dropped = 0
+        self.on_small: Callable[[BagMessage], None] = lambda _: None
         self._kept: dict[str, deque[BagMessage]] = {}
         self._images: deque[BagMessage] = deque()
         self._changed = threading.Condition()
@@ -132,6 +135,7 @@ class NetworkReader:
         with self._changed:
             if not is_image:
                 kept.append(message)
+                self.on_small(message)
                 return
             if not kept:
                 kept.append(message)
@@ -179,9 +183,20 @@ class TopicSource(BagSource):
     def images(self) -> Iterator[StampedImage]:
         """Yield images as they arrive, until `close`."""
         stamps = ImageStamps()
+        for message in self._network.messages(self._info_names):
+            self._watch.take(message)
+        self._network.on_small = self._watch_info
         for message in self._network.images():
             if message.topic.name in self.image_topics:
                 yield self._stamped(message, self.image_topics.index(message.topic.name), stamps)
+
+    def _watch_info(self, message: BagMessage) -> None:
+        """Compare a `CameraInfo` with the one that is used; say so once where it differs."""
+        if message.topic.name in self._info_names:
+            was_same = not self.camera_info_changes
+            self._watch.take(message)
+            if was_same and self.camera_info_changes:
+                _LOGGER.warning("%s changes on the way: %s", message.topic.name, CAMERA_CHANGED)
 
     def transforms(self, frames: Collection[str] | None = None) -> TfBuffer:
         """Return all transforms received so far."""

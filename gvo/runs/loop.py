@@ -18,6 +18,7 @@ from gvo.io.frames import Through, frames, is_lost, one_opencv_thread
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import Source
 from gvo.odometry.odometry import Odometry
+from gvo.runs.outputs.file import FileOutput
 from gvo.runs.statistics import RunStatistics
 from gvo.trajectory.evaluation import Motions
 from gvo.types import Edge, Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Optimum, Progress
@@ -244,6 +245,12 @@ class RunLoop:
         if self.on_tracked is not None:
             self.on_tracked(item, result)
 
+    def discard_files(self) -> None:
+        """Give up the bag and the like, which take most of the disk."""
+        for output in self._outputs:
+            if isinstance(output, FileOutput):
+                output.discard()
+
     def _give(self, write: Callable[[Output], None]) -> None:
         for output in tuple(self._outputs):
             try:
@@ -253,6 +260,8 @@ class RunLoop:
             except RecordingError as error:
                 self._outputs.remove(output)
                 self.output_faults.append(str(error))
+                if isinstance(output, FileOutput):
+                    output.discard()
 
     def _ask_window(self, stamp_ns: int) -> None:
         """Once a second, keep the motion over the last second as the window has it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import resource
@@ -201,6 +202,8 @@ class RunningSummary(AbstractContextManager["RunningSummary"]):
         if not isinstance(error, GvoError | KeyboardInterrupt):
             return
         is_output = isinstance(error, OutputError)
+        if is_output and getattr(error.__cause__, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
+            self._loop.discard_files()  # so that there is room for the summary
         with suppress(OutputError):
             self.write("interrupted", str(error) if is_output else "interrupted")
         if is_output:

@@ -20,7 +20,7 @@ from gvo.errors import RecordingError
 from gvo.io.recording import StampedImage
 from gvo.io.sync import Pair
 from gvo.live.odometry import LiveOdometry, WaitingPairs
-from gvo.live.sources import StandardInput
+from gvo.live.sources import Device, StandardInput
 from gvo.types import FaultyFrame, Progress
 from tests.conftest import ENVIRONMENT, GVO, TABLES, Command, assert_same_files, refused
 from tests.live.conftest import N_FRAMES
@@ -267,6 +267,29 @@ def test_a_device_gives_the_images_of_both_cameras(
     np.testing.assert_allclose(tracked.T_world_frame, expected.T_world_frame, atol=1e-3)
 
 
+class VanishingCamera:
+    """Gives images of a film, at no position, and then none."""
+
+    def __init__(self, film: cv2.VideoCapture) -> None:
+        self.isOpened, self.release = film.isOpened, film.release
+        self.grab, self.retrieve = film.grab, film.retrieve
+
+    def get(self, _: int) -> float:
+        return 0.0
+
+
+def test_a_camera_that_vanishes_is_told(
+    films: Path, drive_bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    film = cv2.VideoCapture(str(films / "both%03d.png"))
+    monkeypatch.setattr(cv2, "VideoCapture", lambda _: VanishingCamera(film))
+    device = Device(["0"], gvo.open_recording(drive_bag).info)
+    ((_, result),) = LiveOdometry(device, max_waiting=1000).run(tmp_path, outputs=NO_REPORT)
+    assert not result.is_complete
+    assert any("0: the camera gives no more images" in line for line in result.warnings)
+    assert n_poses(tmp_path) == N_FRAMES
+
+
 @pytest.mark.parametrize(
     ("words", "fault"),
     [
@@ -276,7 +299,9 @@ def test_a_device_gives_the_images_of_both_cameras(
         (("camera", "/nowhere/film.avi"), "OpenCV opens no camera or film"),
         (("camera", "a", "b", "c"), "side by side, or two"),
         (("camera", "a", "--sensor=rgbd"), "has no depth"),
+        (("camera", "²"), "OpenCV opens no camera or film"),
         (("-", "--queue=0"), "max_waiting >= 1"),
+        (("-", "--max-lag=nan"), "max_lag_s > 0"),
     ],
 )
 @pytest.mark.usefixtures("empty_input")

@@ -493,6 +493,23 @@ def test_images_that_nobody_takes_are_given_up_with_a_word(
     assert len([*play.reader.images()]) == 8  # of 512 MB
 
 
+def test_a_camera_info_that_changes_is_told_once(
+    drive_bag: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def script(play: Play) -> None:
+        infos = [each for each in play.messages if "camera_info" in each.topic.name]
+        play.send_all()
+        play.network.wait_for(ODOMETRY, N_FRAMES)
+        for message in 3 * infos:
+            content = message.decode()
+            content.k = content.k + np.eye(3).ravel()
+            data = serialize(content, message.topic.type, is_ros1=message.is_ros1)
+            play.network.send(replace(message, data=data))
+
+    Play(drive_bag, script).run(tmp_path / "out")
+    assert caplog.text.count("camera_info changes on the way: the first one is used") == 1
+
+
 def test_a_stream_that_stops_is_told_with_the_rate_of_the_other(
     drive_bag: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

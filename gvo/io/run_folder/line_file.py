@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import fcntl
 import io
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from gvo.errors import OutputError, RecordingError, write_faults
+from gvo.errors import OutputError, RecordingError, RunBusyError, write_faults
 
 
 def check_folder(folder: Path) -> None:
@@ -61,6 +62,27 @@ def replace_bytes(path: Path, data: bytes) -> None:
         raise
 
 
+@contextmanager
+def locked(path: Path, busy: str) -> Iterator[None]:
+    """Hold a lock file, which is removed in the end, or raise `RunBusyError`."""
+    with io.FileIO(path, "ab", opener=_open_no_link) as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise RunBusyError(busy) from None
+        except OSError:
+            pass  # a file system without locks
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
+
+
+def _open_no_link(path: str, flags: int) -> int:
+    # A link there may lead out of the folder.
+    return os.open(path, flags | os.O_NOFOLLOW, 0o666)
+
+
 class PartFile:
     """A file written under another name in its folder; it takes its own once it is complete.
 
@@ -86,8 +108,11 @@ class PartFile:
         self.path = path
         self._errors = errors
         check_new(path)
-        with self.refused_on_error():
+        with ExitStack() as stack, self.refused_on_error():
             path.parent.mkdir(parents=True, exist_ok=True)
+            busy = f"{path}: another process is writing it; give another path"
+            stack.enter_context(locked(path.with_name(f".{path.name}.lock"), busy))
+            self._lock = stack.pop_all()
             self._folder = tempfile.TemporaryDirectory(dir=path.parent, prefix=".gvo-part-")
         self.part = Path(self._folder.name) / path.name
 
@@ -98,7 +123,16 @@ class PartFile:
     @contextmanager
     def completed(self, *, is_kept: bool) -> Iterator[None]:
         """Give the file its name after the last lines are written, or remove it."""
-        with self._folder, self.refused_on_error():
+        with self._lock, self._folder, self.refused_on_error():
             yield
             if is_kept:
                 self.part.rename(self.path)
+
+    @contextmanager
+    def discarded(self) -> Iterator[None]:
+        """Free its space, so that a full disk lets it be closed inside; then remove it."""
+        with self._lock, self._folder, suppress(RecordingError), self.refused_on_error():
+            for path in Path(self._folder.name).rglob("*"):
+                if path.is_file():
+                    os.truncate(path, 0)
+            yield

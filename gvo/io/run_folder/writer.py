@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import fcntl
 import io
 import json
 import os
@@ -16,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from gvo._text import visible
-from gvo.errors import OutputError, RunBusyError, write_faults
+from gvo.errors import OutputError, write_faults
 from gvo.geometry import se3
-from gvo.io.run_folder.line_file import append_whole, check_folder, replace_text
+from gvo.io.run_folder.line_file import append_whole, check_folder, locked, replace_text
 from gvo.trajectory.formats import (
     COVARIANCE_HEADER,
     format_covariance_line,
@@ -126,33 +125,21 @@ def written_alone(folder: Path, *, force: bool = False) -> Iterator[None]:
     RunBusyError
         When another process is writing it.
     """
-    path = folder / LOCK
     is_new = not folder.exists()
-    with write_faults(OutputError, folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        file = io.FileIO(path, "ab", opener=_open_no_link)
-    with file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise RunBusyError(
-                f"{folder}: another process is writing this run; wait for its end, or end it"
-            ) from None
-        except OSError:
-            pass  # a file system without locks
-        try:
-            check_unused(folder, force=force)
-            yield
-        finally:
-            path.unlink(missing_ok=True)
+    busy = f"{folder}: another process is writing this run; wait for its end, or end it"
+    with ExitStack() as stack:
+        with write_faults(OutputError, folder):
+            folder.mkdir(parents=True, exist_ok=True)
             if is_new:
-                with suppress(OSError):  # of a run that gave something it is not empty
-                    folder.rmdir()
+                stack.callback(_remove_empty, folder)
+            stack.enter_context(locked(folder / LOCK, busy))
+        check_unused(folder, force=force)
+        yield
 
 
-def _open_no_link(path: str, flags: int) -> int:
-    # A link there may lead out of the folder.
-    return os.open(path, flags | os.O_NOFOLLOW, 0o666)
+def _remove_empty(folder: Path) -> None:
+    with suppress(OSError):  # of a run that gave something it is not empty
+        folder.rmdir()
 
 
 class RunFolder(AbstractContextManager["RunFolder"]):

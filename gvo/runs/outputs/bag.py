@@ -304,6 +304,10 @@ class RunBag(RunMessages, FileOutput):
                 self._bag.__exit__(None, None, None)
                 self._file.part = self._bag.result
 
+    def _discard(self) -> None:
+        with self._file.discarded():
+            self._bag.__exit__(None, None, None)
+
 
 class _PartWriter(BagWriter):
     """Writes a bag; what cannot be written is a RecordingError."""

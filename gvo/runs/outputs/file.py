@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import Self
 
+from gvo.errors import RecordingError
 from gvo.types import Estimate, FaultyFrame, Frame, FrameResult, Optimum
 
 
@@ -40,8 +42,19 @@ class FileOutput:
             self._is_open = False
             self._complete()
 
+    def discard(self) -> None:
+        """Give the file up, and with it its space on the disk."""
+        if self._is_open:
+            self._is_open = False
+            self._discard()
+
     def _complete(self) -> None:
         """Write the last lines, and give the file its name."""
+
+    def _discard(self) -> None:
+        """Remove what was written, or what cannot be: complete it as it is."""
+        with suppress(RecordingError):
+            self._complete()
 
     def __enter__(self) -> Self:
         return self

@@ -212,6 +212,10 @@ class RunRerun(FileOutput):
                 self._add_paths(self._history.paths())
             self._write()
 
+    def _discard(self) -> None:
+        with self._part.discarded():
+            self._file.close()
+
     def _write(self) -> None:
         """Write to the file what was logged since the last time."""
         with self._part.refused_on_error():
