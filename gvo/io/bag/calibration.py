@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -21,7 +22,7 @@ from gvo.io.bag.cameras import (
 )
 from gvo.io.bag.messages import transform_of
 from gvo.io.bag.reader import BagMessage, MessageReader
-from gvo.io.bag.topics import CameraTopics
+from gvo.io.bag.topics import CameraTopics, Topic
 from gvo.io.calibration.camera_info import (
     make_calibration,
     make_rgbd_calibration,
@@ -81,6 +82,7 @@ def calibrations_of_messages(
     decisions = (f"calibration: {first.info_name}; the images are {state}", *first.notes)
     color = make_rgbd_calibration(first.fields, is_rectified=is_rectified)
     view, found = None, ""
+    second = second or _like_color(reader, topics.second, first)
     if second is not None:
         view, found = _depth_view(reader, first, color, second)
     return BagCalibration(
@@ -146,6 +148,15 @@ def _stereo_pair(
     pair = make_pair((left, right), T_left_right, f"{where}: {origin}")
     baseline = stereo_baseline(pair, f"{where}: {origin}")
     return pair, f"baseline: {baseline:.4f} m from {origin}"
+
+
+def _like_color(reader: MessageReader, depth: Topic, color: BagCamera) -> BagCamera | None:
+    """Return the camera of depth without `CameraInfo`: that of colour, with larger pixels if so."""
+    with suppress(CalibrationError, RecordingError):
+        n = color.fields.recorded_size()[0] // max(image_size(reader, depth)[0], 1)
+        x, y = color.fields.binning_factors
+        return replace(color, image=depth, fields=replace(color.fields, binning=(n * x, n * y)))
+    return None
 
 
 def _depth_view(

@@ -187,7 +187,10 @@ class BagReader:
             return BagFile(path)
         folder = Path(tempfile.mkdtemp(prefix="bag-"))
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
-        unpacked, damage = unpack(path, folder)
+        unpacked = folder / path.name.removesuffix(_COMPRESSED)
+        with named_faults(RecordingError, path, f"cannot be decompressed to {folder}"):
+            reason = inflate_file(path, unpacked)
+        damage = f"{path}: is cut or damaged ({reason}); copy it anew" if reason else ""
         try:
             file = BagFile(unpacked)
         except RecordingError as error:
@@ -297,11 +300,3 @@ def _listed_files(metadata: Path) -> dict[str, str]:
 def is_storage(path: Path) -> bool:
     """Tell whether a path is a file of ROS 2, by its name, compressed or not."""
     return path.is_file() and path.name.removesuffix(_COMPRESSED).endswith(STORAGE_SUFFIXES)
-
-
-def unpack(path: Path, folder: Path) -> tuple[Path, str]:
-    """Decompress a `.zstd` file into a folder; return the file, and what is wrong with it."""
-    target = folder / path.name.removesuffix(_COMPRESSED)
-    with named_faults(RecordingError, path, f"cannot be decompressed to {folder}"):
-        reason = inflate_file(path, target)
-    return target, f"{path}: is cut or damaged ({reason}); copy it anew" if reason else ""

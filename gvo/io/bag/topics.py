@@ -43,6 +43,7 @@ _WORD = re.compile(r"[a-z]+|\d+")
 # What the names of all topics of `CameraInfo` hold.
 _OF_INFOS = {"camera", "cam", "info"}
 _NEEDED = "gvo needs a stereo pair, or colour with depth (RGB-D)"
+_FLAGS: dict[Sensor, tuple[str, str]] = {"stereo": ("left", "right"), "rgbd": ("color", "depth")}
 _N_LISTED = 12
 _Names: TypeAlias = tuple[str | None, str | None]
 _Score: TypeAlias = tuple[int, ...]
@@ -104,8 +105,8 @@ class CameraTopics:
     @property
     def flags(self) -> str:
         """What to type to choose them."""
-        names = ("left", "right") if self.sensor == "stereo" else ("color", "depth")
-        return f"--{names[0]} {self.first.name} --{names[1]} {self.second.name}"
+        first, second = _FLAGS[self.sensor]
+        return f"--{first} {self.first.name} --{second} {self.second.name}"
 
 
 def choose_topics(topics: Sequence[Topic], choice: TopicChoice, where: str) -> CameraTopics:
@@ -138,14 +139,12 @@ def choose_topics(topics: Sequence[Topic], choice: TopicChoice, where: str) -> C
         candidates = _best(_fitting(_rgbd_pairs(images, is_found=False), chosen))
     if len(candidates) == 1:
         return candidates[0]
-    for name, topic in zip(("right", "left", "depth", "color"), [*chosen, *chosen], strict=True):
-        # Of each sensor the two flags, the other's of the one that was given.
-        is_of = sensor == ("stereo" if name in ("left", "right") else "rgbd")
-        if topic is not None and not candidates and is_of:
-            raise RecordingError(
-                f"{where}: no partner of {topic.name} is known by its name; give --{name} TOPIC, "
-                f"one of {describe_topics(images)}"
-            )
+    given = first or second
+    if given is not None and sensor is not None and not candidates:
+        raise RecordingError(
+            f"{where}: no partner of {given.name} is known by its name; give "
+            f"--{_FLAGS[sensor][first is not None]} TOPIC, one of {describe_topics(images)}"
+        )
     raise RecordingError(_explain(where, images, candidates))
 
 

@@ -272,7 +272,8 @@ class TfBuffer:
         stamps_ns = np.array([stamp_ns], dtype=np.int64)
         ((path, _),) = self._paths(target, source, stamps_ns)
         if isinstance(path, Failure):
-            found = describe_parents(self.edges, _ancestors(self.edges, (target, source)))
+            above = _ancestors(self.edges, (target, source))
+            found = describe_parents(edge for edge in self.edges if edge[1] in above)
             return Failure(reason=f"{path.reason}; {found}") if found else path
         edge = next(c for c in path.children if not self._climb((c,), stamps_ns)[1][0])
         samples = self._moving[edge].samples()
@@ -422,17 +423,15 @@ def _ancestors(edges: Iterable[tuple[str, str]], frames: Iterable[str]) -> set[s
     return found
 
 
-def describe_parents(
-    edges: Iterable[tuple[str, str]], children: Collection[str] | None = None
-) -> str:
-    """Name the frames, all or some, with more than one parent by edges (parent, child)."""
+def describe_parents(edges: Iterable[tuple[str, str]]) -> str:
+    """Name the frames with more than one parent by edges (parent, child)."""
     parents: dict[str, list[str]] = {}
     for parent, child in sorted(edges):
         parents.setdefault(child, []).append(parent)
     said = [
         f"{child} has the parents {' and '.join(names)}"
         for child, names in parents.items()
-        if len(names) > 1 and (children is None or child in children)
+        if len(names) > 1
     ]
     return f"{list_names(said)}: publish one of them, a frame has one parent" if said else ""
 

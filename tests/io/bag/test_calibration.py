@@ -221,6 +221,21 @@ def test_depth_is_registered_by_frame_and_intrinsics_not_by_a_word(
     assert view.calibration.width == depth.get("width", 48)
 
 
+@pytest.mark.parametrize(("size", "width"), [((48, 32), None), ((24, 16), 24), ((16, 10), 16)])
+def test_depth_without_camera_info_has_larger_pixels_than_colour(
+    tmp_path: Path, size: tuple[int, int], width: int | None
+) -> None:
+    color, _, info, _ = _rgbd()
+    found = _found(tmp_path / "a.bag", [color, _image("/c/depth/image_raw", size), info])
+    assert found.info_names == ("/c/rgb/camera_info",)
+    view = found.depth_view
+    assert (None if view is None else view.calibration.width) == width
+    if view is not None:
+        assert view.calibration.height == size[1]
+        assert view.calibration.K[0, 0] == pytest.approx(50.0 * size[0] / 48)
+        np.testing.assert_array_equal(view.T_color_depth, np.eye(4))
+
+
 @pytest.mark.parametrize(("fx", "is_registered"), [(50.0, True), (49.6, False)])
 def test_depth_of_the_rectified_image_is_not_that_of_a_raw_one(
     tmp_path: Path, fx: float, is_registered: bool
