@@ -196,7 +196,8 @@ class PoseGraph:
 
     def _note_fix(self, key: int) -> None:
         """Learn how many poses lie between the measurements of poses in the world."""
-        last, self._last_fix_key = self._last_fix_key, key
+        last = self._last_fix_key
+        self._last_fix_key = key if last is None else max(key, last)
         if last is None or key <= last:
             return
         if (interval := key - last) > _MAX_FIX_INTERVAL:

@@ -37,7 +37,7 @@ def figure_of_errors(
     unit, scale = ("mm", 1e3) if largest_m < 1.0 else ("m", 1.0)
     labelled = {f"{c.name} (ATE {scale * c.ate_m:.3g} {unit})": c.trajectory for c in compared}
     lines = lines_of(shown, labelled)
-    ends = {} if loops is None else loop_ends(loops, compared[-1].trajectory)
+    ends = {} if not loops else loop_ends(loops, compared[-1].trajectory)
     marks = loop_lines({name: ends[name] for name in ends if name == "loops"})
     _draw_view(view, figure, [*lines, *marks], reference)
     for c, line in zip(compared, lines[1:], strict=True):
