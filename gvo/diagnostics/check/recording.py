@@ -32,6 +32,7 @@ def check_recording(
     config: Config | None = None,
     *,
     n_samples: int = _N_SAMPLES,
+    learn_readout: bool = True,
     transforms: TfBuffer | None = None,
     base_frame: str = "base_link",
 ) -> CheckResult:
@@ -48,6 +49,8 @@ def check_recording(
         As for odometry.
     n_samples : int
         Number of decoded frames, each with the next one.
+    learn_readout : bool
+        Run odometry over parts of the recording, to tell a rolling shutter.
     transforms : TfBuffer, optional
         Transforms of the same bag; if None, the tree of frames is not checked.
     base_frame : str
@@ -80,7 +83,7 @@ def check_recording(
         findings += check_depth(found.samples, config)
     elif not isinstance(camera, Failure):
         findings += check_stereo(found.samples, camera, config)
-    if not isinstance(camera, Failure):
+    if learn_readout and not isinstance(camera, Failure):
         findings += check_shutter(source, found, config)
     changes = describe_camera_changes(source)
     if changes is not None:
