@@ -200,10 +200,10 @@ def read_text(path: Path, *, max_bytes: int) -> str:
     return data.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
 
 
-def wrapped(text: str, indent: str = "") -> list[str]:
-    """Return lines of at most `MAX_WIDTH` characters; a longer word is not broken."""
+def wrapped(text: str, indent: str = "", *, width: int = MAX_WIDTH) -> list[str]:
+    """Return lines of at most so many characters; a longer word is not broken."""
     options: Any = {"break_long_words": False, "break_on_hyphens": False}
-    return wrap(text, MAX_WIDTH, subsequent_indent=indent, **options)
+    return wrap(text, width, subsequent_indent=indent, **options)
 
 
 def number_text(value: float | None, form: str = ".4g") -> str:

@@ -197,8 +197,10 @@ class PoseGraph:
     def _note_fix(self, key: int) -> None:
         """Learn how many poses lie between the measurements of poses in the world."""
         last = self._last_fix_key
-        self._last_fix_key = key if last is None else max(key, last)
-        if last is None or key <= last:
+        if last is not None and key <= last:
+            return
+        self._last_fix_key = key
+        if last is None:
             return
         if (interval := key - last) > _MAX_FIX_INTERVAL:
             if not self._is_warned and self._config.size is not None:

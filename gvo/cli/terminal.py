@@ -14,14 +14,13 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from textwrap import wrap
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TextIO
 
 import typer
 from typer import Option
 from typer.core import TyperCommand
 
-from gvo._text import cut, visible
+from gvo._text import cut, visible, wrapped
 
 if TYPE_CHECKING:
     from gvo.config import Config
@@ -153,7 +152,7 @@ def _fitted(line: str, stream: TextIO) -> str:
         return line
     n_columns = shutil.get_terminal_size().columns
     if len(line) > n_columns:
-        line = "\n".join(wrap(line, n_columns, break_long_words=False, break_on_hyphens=False))
+        line = "\n".join(wrapped(line, width=n_columns))
     return line if os.environ.get("NO_COLOR") else _VERDICT.sub(_coloured, line)
 
 
