@@ -6,6 +6,7 @@ import json
 import os
 import sys
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -319,8 +320,8 @@ def compare(
         int | None, Option(min=1, metavar="N", help="Start a segment at every Nth pose.")
     ] = None,
     max_difference: Annotated[
-        float | None, Option(min=0.0, metavar="S", help="Associate stamps within so many seconds.")
-    ] = None,
+        float, Option(min=0.0, metavar="S", help="Associate stamps within so many seconds.")
+    ] = 0.01,
     offset: Annotated[
         str, Option(metavar="S", help="Seconds to add to the stamps of estimates, or auto.")
     ] = "0",
@@ -346,13 +347,19 @@ def compare(
     truth, trajectories, notes = read_compared(reference, estimates)
     warn(notes)
     trajectories = {
-        name: _by_clock(truth, each, name, offset, max_difference)
-        for name, each in trajectories.items()
+        name: _by_clock(truth, each, name, offset) for name, each in trajectories.items()
     }
     lengths = None if segments is None else _parse_lengths(segments)
+    max_difference_ns = round(1e9 * max_difference)
     evaluations = [
         evaluate(
-            truth, trajectory, name=name, align=align, segments=lengths, segment_step=segment_step
+            truth,
+            trajectory,
+            name=name,
+            align=align,
+            segments=lengths,
+            segment_step=segment_step,
+            max_difference_ns=max_difference_ns,
         )
         for name, trajectory in trajectories.items()
     ]
@@ -364,12 +371,14 @@ def compare(
     if plot is not None:
         from gvo.viz.plots import plot_trajectories
 
-        plot_trajectories(plot, truth, trajectories, align=align)
+        plot_trajectories(
+            plot, truth, trajectories, align=align, max_difference_ns=max_difference_ns
+        )
     if report_file is not None or plots is not None:
         from gvo.viz.report import write_comparison_report
 
         write_comparison_report(
-            report_file, truth, trajectories, evaluations, align=align, plots=plots
+            report_file, truth, evaluations, align=align, segments=lengths, plots=plots
         )
 
 
@@ -430,13 +439,11 @@ def _parse_lengths(text: str) -> list[float]:
     return lengths
 
 
-def _by_clock(
-    truth: Trajectory, estimate: Trajectory, name: str, offset: str, max_difference: float | None
-) -> Trajectory:
-    """Return an estimate by the clock of the truth, as the options say."""
-    from gvo.trajectory.alignment import clock_offset, synchronized
-
+def _by_clock(truth: Trajectory, estimate: Trajectory, name: str, offset: str) -> Trajectory:
+    """Return an estimate by the clock of the truth, as the option says."""
     if offset == "auto":
+        from gvo.trajectory.alignment import clock_offset
+
         offset_ns = clock_offset(truth, estimate)
         say(f"{name}: {1e-9 * offset_ns:+.4f} s added to its stamps", err=True)
     else:
@@ -445,8 +452,7 @@ def _by_clock(
         except (ValueError, OverflowError):
             expected = "expected seconds, such as 0.05, or auto"
             raise ConfigurationError(f"--offset {offset}: {expected}") from None
-    max_ns = None if max_difference is None else round(1e9 * max_difference)
-    return synchronized(truth, estimate, offset_ns=offset_ns, max_difference_ns=max_ns)
+    return replace(estimate, stamps_ns=estimate.stamps_ns + offset_ns)
 
 
 def _tell_causes(evaluations: Sequence[Evaluation]) -> None:

@@ -114,20 +114,6 @@ def _rates(trajectory: Trajectory, step_ns: int) -> FloatArray:
     return np.asarray(rates / np.maximum(rates.std(axis=1, keepdims=True), 1e-12))
 
 
-def synchronized(
-    reference: Trajectory, estimate: Trajectory, *, offset_ns: int, max_difference_ns: int | None
-) -> Trajectory:
-    """Return an estimate by the clock of its reference.
-
-    With a largest difference it has the stamps of the associated poses of the reference.
-    """
-    moved = replace(estimate, stamps_ns=estimate.stamps_ns + offset_ns)
-    if max_difference_ns is None:
-        return moved
-    ref, est = pair(reference, moved, max_difference_ns=max_difference_ns)
-    return replace(est, stamps_ns=ref.stamps_ns)
-
-
 def _step(trajectory: Trajectory) -> float:
     """Return the median step between stamps, nanoseconds; infinite for a single pose."""
     return float(np.median(np.diff(trajectory.stamps_ns))) if len(trajectory) > 1 else np.inf

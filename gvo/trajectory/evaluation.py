@@ -59,8 +59,10 @@ class Evaluation:
     ----------
     name : str
         Of the estimate.
-    stamps_ns : ndarray of int64, shape (n,)
-        Of the associated reference poses, nanoseconds.
+    trajectory : Trajectory
+        The whole estimate, aligned.
+    reference, estimate : Trajectory
+        The n associated poses of the reference, and those of the aligned estimate.
     errors_m : ndarray of float64, shape (n,)
         Distance of each aligned position from the reference, metres.
     rpe_m, rpe_deg : float or None
@@ -88,7 +90,9 @@ class Evaluation:
     """
 
     name: str
-    stamps_ns: IntArray
+    trajectory: Trajectory
+    reference: Trajectory
+    estimate: Trajectory
     errors_m: FloatArray
     rpe_m: float | None
     rpe_deg: float | None
@@ -111,6 +115,17 @@ class Evaluation:
     def n(self) -> int:
         """Number of associated poses."""
         return len(self.errors_m)
+
+    @property
+    def errors_rad(self) -> FloatArray | None:
+        """Rotation error of each pose since the first one, shape (n,); None without rotations.
+
+        An alignment leaves the roll about a straight path undetermined.
+        """
+        if not _have_rotations(self.reference, self.estimate):
+            return None
+        later = np.arange(self.n)
+        return _pair_errors(self.reference, self.estimate, np.zeros_like(later), later)[1]
 
     @property
     def ate_m(self) -> float:
@@ -156,7 +171,8 @@ def evaluate(
             f"{name} and the reference have poses in common: {len(ref)}, expected at least "
             f"{_MIN_POSES}"
         )
-    aligned = alignment(ref, est, align).apply(est)
+    similarity = alignment(ref, est, align)
+    aligned = similarity.apply(est)
     usual, usual_step = usual_segments(ref)
     segments = usual if segments is None else segments
     segment_step = usual_step if segment_step is None else segment_step
@@ -165,7 +181,9 @@ def evaluate(
     shares, turns = segment_errors(ref, aligned, lengths_m=segments, step=segment_step)
     return Evaluation(
         name=name,
-        stamps_ns=ref.stamps_ns,
+        trajectory=similarity.apply(estimate),
+        reference=ref,
+        estimate=aligned,
         errors_m=np.linalg.norm(ref.positions - aligned.positions, axis=1),
         rpe_m=_root(_mean(step_t**2)),
         rpe_deg=_root(_mean(np.rad2deg(step_r) ** 2)),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gvo.io.run_folder.reader import Table
-from gvo.trajectory.alignment import AlignMode
+from gvo.trajectory.alignment import MAX_DIFFERENCE_NS, AlignMode
 from gvo.trajectory.trajectory import Trajectory
 from gvo.viz.names import check_suffix
 
@@ -27,6 +27,7 @@ def plot_trajectories(
     *,
     align: AlignMode = "se3",
     loops: Table | None = None,
+    max_difference_ns: int = MAX_DIFFERENCE_NS,
 ) -> Figure:
     """Draw trajectories from above, and their errors (or positions) over time.
 
@@ -45,6 +46,8 @@ def plot_trajectories(
     loops : mapping of str to ndarray, optional
         Columns `stamp_ns`, `reference_ns` and `reason` of a run's `loops.csv`: those that count
         are marked on the last estimate, where there is a reference.
+    max_difference_ns : int
+        Largest difference of associated stamps, nanoseconds.
 
     Returns
     -------
@@ -56,7 +59,8 @@ def plot_trajectories(
     ConfigurationError
         When the file name has another suffix.
     TrajectoryError
-        When an estimate and the reference have no pose in common, or the file cannot be written.
+        When an estimate and the reference share fewer than three poses, or the file cannot be
+        written.
     ValueError
         When there is no estimate, or one without poses.
     """
@@ -72,7 +76,8 @@ def plot_trajectories(
         if reference is None:
             figure = figure_of_positions(estimates)
         else:
-            figure = figure_of_errors(reference, estimates, align, loops)
+            options = {"align": align, "max_difference_ns": max_difference_ns}
+            figure = figure_of_errors(reference, estimates, loops, **options)
         if path is not None:
             save_figure(figure, path)
     return figure

@@ -26,7 +26,7 @@ from gvo.trajectory.evaluation import (
 )
 from gvo.trajectory.formats import read_trajectory, write_kitti, write_tum
 from gvo.trajectory.trajectory import Trajectory
-from tests.trajectory.paths import seeds, straight, unturned
+from tests.trajectory.paths import circle, seeds, straight, unturned
 
 ALIGNED: tuple[AlignMode, ...] = ("se3", "sim3")
 
@@ -197,7 +197,17 @@ def test_the_share_is_that_of_the_reference_that_the_estimate_reaches() -> None:
     half = reference.select(slice(25, 76, 2))
     evaluation = evaluate(reference, half, name="half")
     assert (evaluation.n, evaluation.reference_share) == (26, 0.5)
-    np.testing.assert_array_equal(evaluation.stamps_ns, half.stamps_ns)
+    np.testing.assert_array_equal(evaluation.reference.stamps_ns, half.stamps_ns)
+
+
+def test_rotation_errors_are_of_the_rotation_since_the_first_pose() -> None:
+    truth = circle(50)
+    turned = truth.T_world_frame.copy()
+    turned[25:] = turned[25:] @ se3.exp(np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0]))
+    estimate = Trajectory(stamps_ns=truth.stamps_ns, T_world_frame=turned)
+    errors = evaluate(truth, estimate.moved(truth.T_world_frame[7]), name="a").errors_rad
+    assert errors is not None
+    np.testing.assert_allclose(errors, [0.0] * 25 + [0.1] * 25, atol=1e-6)
 
 
 def test_wrong_use_is_refused() -> None:

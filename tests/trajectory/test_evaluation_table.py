@@ -7,10 +7,14 @@ import numpy as np
 import pytest
 
 from gvo.trajectory.evaluation import Evaluation, evaluations_json, format_evaluations
+from tests.trajectory.paths import still
 
+TWO = still([0, 1])
 FULL = Evaluation(
     name="smoothed",
-    stamps_ns=np.arange(2),
+    trajectory=TWO,
+    reference=TWO,
+    estimate=TWO,
     errors_m=np.array([3.0, 4.0]),
     rpe_m=0.0123456,
     rpe_deg=0.25,
@@ -23,7 +27,9 @@ FULL = Evaluation(
 )
 BARE = Evaluation(
     name="a name that is longer than its header",
-    stamps_ns=np.arange(1),
+    trajectory=TWO,
+    reference=TWO,
+    estimate=TWO,
     errors_m=np.array([1234.5]),
     rpe_m=None,
     rpe_deg=None,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import cycle
 from typing import Any
 
@@ -18,8 +18,8 @@ from gvo.trajectory.evaluation import (
     KITTI_SEGMENTS_M,
     N_DOF,
     Consistency,
+    Evaluation,
     chi2_bound,
-    usual_segments,
 )
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
@@ -35,7 +35,7 @@ from gvo.viz.figures import (
     plain,
     plain_decades,
 )
-from gvo.viz.measures import Comparison, Drift, chi2_density, drift, drift_lengths
+from gvo.viz.measures import drift, drift_lengths
 from gvo.viz.palette import Style, styles_of
 from gvo.viz.report.paths import World
 from gvo.viz.report.trajectories import ANGLES, POSITIONS, draw_values
@@ -89,10 +89,10 @@ def _plot(slug: str, figure: Figure, **facts: object) -> Plot:
     return Plot(slug=slug, title=TITLES[slug], figure=figure, facts=facts)
 
 
-def pose_plots(truth: Trajectory, comparisons: Sequence[Comparison], world: World) -> list[Plot]:
+def pose_plots(truth: Trajectory, evaluations: Sequence[Evaluation], world: World) -> list[Plot]:
     """Return the paths coloured by their errors, and positions and angles over time."""
-    estimates = {c.name: c.trajectory for c in comparisons}
-    plots = [_plot("error_path", _error_path(truth, comparisons, world))]
+    estimates = {c.name: c.trajectory for c in evaluations}
+    plots = [_plot("error_path", _error_path(truth, evaluations, world))]
     plots.append(_plot("positions", _values(truth, estimates, POSITIONS)))
     if not all(each.has_rotations for each in (truth, *estimates.values())):
         return [*plots, *not_drawn(["angles"], "there are positions without rotations")]
@@ -115,13 +115,13 @@ def _values(truth: Trajectory, estimates: dict[str, Trajectory], *what: Any) -> 
     return figure
 
 
-def _error_path(truth: Trajectory, comparisons: Sequence[Comparison], world: World) -> Figure:
-    n, n_columns = len(comparisons), min(len(comparisons), 2)
+def _error_path(truth: Trajectory, evaluations: Sequence[Evaluation], world: World) -> Figure:
+    n, n_columns = len(evaluations), min(len(evaluations), 2)
     n_rows = -(-n // n_columns)
     figure = new_figure(_PATH_HEIGHT * n_rows)
     panels = [figure.add_subplot(n_rows, n_columns, number) for number in range(1, n + 1)]
-    largest_m = max(float(c.errors_m.max()) for c in comparisons)
-    for axes, c in zip(panels, comparisons, strict=True):
+    largest_m = max(float(c.errors_m.max()) for c in evaluations)
+    for axes, c in zip(panels, evaluations, strict=True):
         axes.plot(*truth.positions[:, world.ground].T, color="black", ls="--", lw=0.7)
         points = c.estimate.positions[:, world.ground]
         looks: dict[str, Any] = {"cmap": "viridis", "clim": (0.0, largest_m), "linewidths": 2.5}
@@ -133,17 +133,17 @@ def _error_path(truth: Trajectory, comparisons: Sequence[Comparison], world: Wor
     return figure
 
 
-def error_plots(comparisons: Sequence[Comparison], align: AlignMode) -> list[Plot]:
+def error_plots(evaluations: Sequence[Evaluation], align: AlignMode) -> list[Plot]:
     """Return the errors over time and over the distance travelled."""
-    first_ns = min(int(c.reference.stamps_ns[0]) for c in comparisons)
-    is_by_row = any(c.reference.stamps_from == "rows" for c in comparisons)
+    first_ns = min(int(c.reference.stamps_ns[0]) for c in evaluations)
+    is_by_row = any(c.reference.stamps_from == "rows" for c in evaluations)
     over_time = _curves(
-        comparisons,
+        evaluations,
         lambda c: elapsed(c.reference.stamps_ns, first_ns),
         "row" if is_by_row else "elapsed [s]",
     )
-    travelled = _curves(comparisons, lambda c: c.reference.distances(), "distance travelled [m]")
-    has_rotations = any(c.errors_rad is not None for c in comparisons)
+    travelled = _curves(evaluations, lambda c: c.reference.distances(), "distance travelled [m]")
+    has_rotations = any(c.errors_rad is not None for c in evaluations)
     return [
         _plot("errors_over_time", over_time, align=align, has_rotations=has_rotations),
         _plot("errors_over_distance", travelled),
@@ -151,13 +151,13 @@ def error_plots(comparisons: Sequence[Comparison], align: AlignMode) -> list[Plo
 
 
 def _curves(
-    comparisons: Sequence[Comparison], abscissa: Callable[[Comparison], FloatArray], label: str
+    evaluations: Sequence[Evaluation], abscissa: Callable[[Evaluation], FloatArray], label: str
 ) -> Figure:
-    has_rotations = any(c.errors_rad is not None for c in comparisons)
+    has_rotations = any(c.errors_rad is not None for c in evaluations)
     n_rows = 2 if has_rotations else 1
     figure = new_figure(0.9 + n_rows * _ROW_HEIGHT)
     rows = figure.subplots(n_rows, 1, sharex=True, squeeze=False)[:, 0]
-    for c, style in zip(comparisons, styles_of(c.name for c in comparisons), strict=True):
+    for c, style in zip(evaluations, styles_of(c.name for c in evaluations), strict=True):
         x, seconds = abscissa(c), c.reference.stamps_ns / 1e9
         text = f"{c.name} (RMSE {c.ate_m:.3g} m)"
         draw_curve(rows[0], x, c.errors_m, style, seconds=seconds, label=text)
@@ -175,41 +175,42 @@ def _curves(
 
 
 def drift_plot(
-    comparisons: Sequence[Comparison], *, asked_m: Sequence[float] | None = None
+    evaluations: Sequence[Evaluation], *, asked_m: Sequence[float] | None = None
 ) -> Plot:
     """Return the drift by the length of segments."""
-    longest = max((c.reference for c in comparisons), key=lambda path: path.distances()[-1])
-    path_m = float(longest.distances()[-1])
-    is_asked = asked_m is not None and tuple(asked_m) != usual_segments(longest)[0]
-    lengths = tuple(asked_m) if asked_m is not None and is_asked else drift_lengths(path_m)
-    found = [(c.name, drift(c, lengths)) for c in comparisons]
-    n_segments = next((int(item.n_segments[-1]) for _, item in found if item is not None), None)
-    if n_segments is None:
+    path_m = max(float(c.reference.distances()[-1]) for c in evaluations)
+    lengths = drift_lengths(path_m) if asked_m is None else asked_m
+    found = {c.name: drift(c, lengths) for c in evaluations}
+    counts = [int(rows[-1, 3]) for rows in found.values() if len(rows)]
+    if not counts:
         reason = (
             "the ground truth holds no rotations, which segments are compared by"
-            if any(c.errors_rad is None for c in comparisons)
+            if any(c.errors_rad is None for c in evaluations)
             else f"the path of {path_m:.2g} m is too short for segments"
         )
         return _not_drawn("drift", reason)
-    origin = "the lengths asked for" if is_asked else f"round lengths for a path of {path_m:.3g} m"
+    origin = f"round lengths for a path of {path_m:.3g} m"
     if lengths == KITTI_SEGMENTS_M:
         origin = "the standard lengths of the KITTI benchmark"
-    return _plot("drift", _drift_figure(found), origin=origin, n_segments=n_segments)
+    elif asked_m is not None:
+        origin = "the lengths asked for"
+    return _plot("drift", _drift_figure(found), origin=origin, n_segments=counts[0])
 
 
-def _drift_figure(found: Sequence[tuple[str, Drift | None]]) -> Figure:
+def _drift_figure(found: Mapping[str, FloatArray]) -> Figure:
     figure = new_figure(3.5)
     panels: Any = figure.subplots(1, 2)
-    styles = styles_of(name for name, _ in found)
-    for (name, item), style, marker in zip(found, styles, cycle("osD^vP*X"), strict=False):
-        if item is not None:
-            looks = {"color": style.color, "ls": style.linestyle, "marker": marker, "ms": 4.5}
-            panels[0].plot(item.lengths_m, item.translations_pct, label=plain(name), **looks)
-            panels[1].plot(item.lengths_m, item.rotations_deg_per_m, **looks)
-    panels[0].set(xlabel="length of segment [m]", ylabel="translation error [%]")
-    panels[1].set(xlabel="length of segment [m]", ylabel="rotation error [deg/m]")
-    for axes in panels:
-        axes.set(xlim=(0.0, None), ylim=(0.0, 1.1 * axes.dataLim.y1 or 1.0))
+    for (name, rows), style, marker in zip(
+        found.items(), styles_of(found), cycle("osD^vP*X"), strict=False
+    ):
+        looks = {"color": style.color, "ls": style.linestyle, "marker": marker, "ms": 4.5}
+        for axes, column in zip(panels, (1, 2), strict=True):
+            axes.plot(rows[:, 0], rows[:, column], label=plain(name), **looks)
+    for axes, label in zip(
+        panels, ("translation error [%]", "rotation error [deg/m]"), strict=True
+    ):
+        axes.set(xlabel="length of segment [m]", ylabel=label, xlim=(0.0, None))
+        axes.set_ylim(0.0, 1.1 * axes.dataLim.y1 or 1.0)
     legend_above(figure, panels[0])
     return figure
 
@@ -417,8 +418,9 @@ def _histogram(edges: Table, bound: float) -> Figure:
                 **looks,
             )
     grid = np.linspace(*_DECADES, 400)
-    # density over the decimal logarithm
-    density = chi2_density(10.0**grid) * 10.0**grid * np.log(10.0)
+    values = 10.0**grid
+    # that of 6 degrees of freedom, over the decimal logarithm
+    density = values**2 * np.exp(-0.5 * values) / 16.0 * values * np.log(10.0)
     axes.plot(grid, density, color="black", ls="--", label="chi-square of 6 dof")
     axes.axvline(np.log10(bound), color="black", ls=":", label=f"95 % bound: {bound:.1f}")
     decades = range(int(_DECADES[0]), int(_DECADES[1]) + 1)

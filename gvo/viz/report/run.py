@@ -15,10 +15,16 @@ from gvo.errors import TrajectoryError
 from gvo.io.run_folder.reader import RunRecord, Table, loop_ends
 from gvo.io.run_folder.verdict import loop_words, verdict
 from gvo.trajectory.alignment import AlignMode
-from gvo.trajectory.evaluation import Evaluation, consistency, evaluation_table, motions_of_chain
+from gvo.trajectory.evaluation import (
+    Evaluation,
+    consistency,
+    evaluate,
+    evaluation_table,
+    motions_of_chain,
+)
 from gvo.trajectory.trajectory import Trajectory
 from gvo.viz.figures import Plot, elapsed, evenly, style, write_plots
-from gvo.viz.measures import Comparison, compare, truth_around
+from gvo.viz.measures import truth_around
 from gvo.viz.pages import changes, write_page
 from gvo.viz.report.paths import (
     TITLES,
@@ -49,10 +55,10 @@ _MAX_LOOPS = 20
 def write_comparison_report(
     path: str | Path | None,
     truth: Trajectory,
-    trajectories: Mapping[str, Trajectory],
     evaluations: Sequence[Evaluation],
     *,
     align: AlignMode,
+    segments: Sequence[float] | None = None,
     plots: str | Path | None = None,
 ) -> None:
     """Write the report of estimates compared with a reference; equal input gives equal files.
@@ -63,12 +69,12 @@ def write_comparison_report(
         HTML file; only the plots are written where omitted.
     truth : Trajectory
         The reference.
-    trajectories : mapping of str to Trajectory
-        By name, at least one.
     evaluations : sequence of Evaluation
-        Of the same estimates.
+        Of the estimates, at least one.
     align : {"none", "origin", "se3", "sim3"}
-        Alignment of each estimate with the reference.
+        How each was aligned with the reference.
+    segments : sequence of float, optional
+        Their lengths in metres, where they were asked for.
     plots : str or Path, optional
         Folder for the plots as PNG and PDF.
 
@@ -77,23 +83,20 @@ def write_comparison_report(
     ConfigurationError
         When a file or the folder cannot be written.
     TrajectoryError
-        When nothing can be associated, or a plot cannot be written.
+        When a plot cannot be written.
     ValueError
         When there is no estimate.
     """
-    if not trajectories:
+    if not evaluations:
         raise ValueError("expected at least one estimate")
-    compared = [compare(truth, t, name=name, align=align) for name, t in trajectories.items()]
-    asked_m = evaluations[0].segments_m if evaluations else None
-    world = World.of(truth)
-    shown = truth_around(truth, [c.reference for c in compared])
-    names = ", ".join(trajectories)
+    world, shown = World.of(truth), truth_around(truth, evaluations)
+    names = ", ".join(each.name for each in evaluations)
     facts = {"Estimates": names, "Poses of the reference": str(len(truth)), "Alignment": align}
     with style():
-        lines = lines_of(shown, {c.name: c.trajectory for c in compared})
-        drawn = path_plots(lines, world) + pose_plots(shown, compared, world)
-        drawn += error_plots(compared, align)
-        drawn.append(drift_plot(compared, asked_m=asked_m))
+        lines = lines_of(shown, {c.name: c.trajectory for c in evaluations})
+        drawn = path_plots(lines, world) + pose_plots(shown, evaluations, world)
+        drawn += error_plots(evaluations, align)
+        drawn.append(drift_plot(evaluations, asked_m=segments))
         if path is not None:
             header, rows = evaluation_table(evaluations)
             write_page(
@@ -155,25 +158,24 @@ def write_run_report(
 
 def _compare(
     record: RunRecord, estimates: Mapping[str, Trajectory]
-) -> tuple[list[Comparison], str]:
+) -> tuple[list[Evaluation], str]:
     """Return the comparisons with the ground truth, or why there are none."""
     if record.truth is None or not estimates:
         found = str(record.summary.get("ground_truth") or "")
         return [], found.removeprefix("none: ") or "the run has no ground truth"
     try:
         return [
-            compare(record.truth, estimate, name=name, align="se3")
-            for name, estimate in estimates.items()
+            evaluate(record.truth, estimate, name=name) for name, estimate in estimates.items()
         ], ""
     except TrajectoryError as error:
         return [], str(error)
 
 
 def _lines(
-    record: RunRecord, estimates: Mapping[str, Trajectory], compared: list[Comparison]
+    record: RunRecord, estimates: Mapping[str, Trajectory], compared: list[Evaluation]
 ) -> tuple[list[Line], World | None]:
     if compared and record.truth is not None:
-        shown = truth_around(record.truth, [c.reference for c in compared])
+        shown = truth_around(record.truth, compared)
         return lines_of(shown, {c.name: c.trajectory for c in compared}), World.of(record.truth)
     if not estimates:
         return [], None
@@ -187,7 +189,7 @@ def _path_plots(lines: list[Line], world: World | None) -> list[Plot]:
     return [Plot(slug=slug, title=title, text=text) for slug, title in TITLES.items()]
 
 
-def _truth_plots(record: RunRecord, compared: list[Comparison], reason: str) -> list[Plot]:
+def _truth_plots(record: RunRecord, compared: list[Evaluation], reason: str) -> list[Plot]:
     if not compared or record.truth is None:
         return not_drawn(_TRUTH_PLOTS, f"errors need ground truth, and {reason.removesuffix('.')}")
     return [

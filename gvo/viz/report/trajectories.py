@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from gvo.io.run_folder.reader import Table, loop_ends
-from gvo.trajectory.alignment import AlignMode
+from gvo.trajectory.evaluation import evaluate
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
 from gvo.viz.figures import draw_curve, elapsed, legend_below, new_figure
-from gvo.viz.measures import compare, truth_around
+from gvo.viz.measures import truth_around
 from gvo.viz.palette import REFERENCE_STYLE, styles_of
 from gvo.viz.plots import ground_plane
 from gvo.viz.report.paths import Line, draw_lines, lines_of, loop_lines
@@ -25,12 +26,12 @@ ANGLES = ("roll [deg]", "pitch [deg]", "yaw [deg]")
 def figure_of_errors(
     reference: Trajectory,
     estimates: Mapping[str, Trajectory],
-    align: AlignMode,
     loops: Table | None = None,
+    **options: Any,  # noqa: ANN401 - of `evaluate`
 ) -> Figure:
     """Draw estimates aligned with a reference, their errors, and the loops of the last one."""
-    compared = [compare(reference, e, name=name, align=align) for name, e in estimates.items()]
-    shown = truth_around(reference, [c.reference for c in compared])
+    compared = [evaluate(reference, e, name=name, **options) for name, e in estimates.items()]
+    shown = truth_around(reference, compared)
     figure = new_figure(_HEIGHT_INCHES)
     view, errors = figure.subplots(1, 2)
     largest_m = max(float(c.errors_m.max()) for c in compared)
@@ -43,7 +44,7 @@ def figure_of_errors(
     for c, line in zip(compared, lines[1:], strict=True):
         elapsed_s = elapsed(c.reference.stamps_ns, int(shown.stamps_ns[0]))
         draw_curve(errors, elapsed_s, scale * c.errors_m, line.style)
-    words = f"position error [{unit}], alignment: {align}"
+    words = f"position error [{unit}], alignment: {options['align']}"
     errors.set(xlabel=stamp_label(shown), ylabel=words, ylim=(0.0, None))
     return figure
 
