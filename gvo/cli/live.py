@@ -96,7 +96,11 @@ def live(
         work.on_signal = has_signal.set
         sinks = _connect(camera, qos, foxglove, stack)
         kind, *devices = camera
+        if kind != "ros2":
+            opt.refuse("only ROS 2 has it", qos=qos != "sensor")
         if kind in _NETWORKS:
+            own = {"sensor": sensor != "stereo", "rectified": is_rectified}
+            opt.refuse("only - and camera have it, ROS says so itself", **own)
             source, base_frame = _wait(sinks[0], parameters, options, has_signal, frame)
         else:
             source = _own_camera(devices, parameters, options, sensor, is_rectified)
@@ -200,15 +204,18 @@ def _own_camera(
 ) -> Source:
     from gvo.io.calibration.files import paths_of
     from gvo.io.frames import Rig
-    from gvo.live.sources import Device, ProcessInput
+    from gvo.io.opening import refuse_topics
+    from gvo.live.sources import Device, StandardInput
 
+    refuse_topics(options, "camera" if names else "-")
     files = paths_of(options.calibration)
     if not 1 <= len(files) <= 2:
         raise ConfigurationError(f"expected one or two --calibration, got {len(files)}")
     rig = Rig(*files, sensor=sensor, is_rectified=is_rectified)
     if names:
         return Device(names, rig.info)
-    return ProcessInput(sys.stdin.fileno(), rig.info, config, depth_scale=rig.depth_scale)
+    number, scale = sys.stdin.fileno(), rig.depth_scale
+    return StandardInput(rig.info, config, depth_scale=scale, number=number)
 
 
 def _status(odometry: LiveOdometry) -> Callable[[Progress], None]:

@@ -106,11 +106,18 @@ def is_bag(path: Path) -> bool:
     return (path / "metadata.yaml").is_file() or any(map(is_storage, path.iterdir()))
 
 
-def _open_folder(path: Path, config: Config, options: RecordingOptions) -> Source:
+def refuse_topics(options: TopicChoice, where: str | Path) -> None:
+    """Refuse a choice of topics where there are none."""
     for name in _TOPICS:
         if getattr(options, name):
             flag = f"--{name.replace('_', '-')}"
-            raise RecordingError(f"{path}: {flag} chooses a topic of a bag, this is not a bag")
+            raise RecordingError(
+                f"{where}: {flag} chooses a topic of a bag or of ROS, here is none"
+            )
+
+
+def _open_folder(path: Path, config: Config, options: RecordingOptions) -> Source:
+    refuse_topics(options, path)
     if _is_kitti(path):
         return KittiSource(path, calibration=options.calibration, config=config)
     if (path / "mav0").is_dir() or (path / "cam0").is_dir():

@@ -6,7 +6,7 @@ way from any source to frames: pair by stamp, decode, check, make grey, rectify.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
@@ -148,10 +148,13 @@ class ChosenImages:
     info : RecordingInfo
     images : callable
         Yields them in the order of the recording.
+    camera_info_changes : mapping of str to int, optional
+        As of `BagSource`; None where the recording has no `CameraInfo`.
     """
 
     info: RecordingInfo
     images: Callable[[], Iterator[StampedImage]]
+    camera_info_changes: Mapping[str, int] | None = None
 
     def ground_truth(self) -> Trajectory | None:
         """Return nothing."""

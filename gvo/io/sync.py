@@ -106,7 +106,7 @@ class _Answers:
 
     def __init__(self, limit_ns: int, partner: str, *, is_live: bool) -> None:
         self._limit_ns, self._partner = limit_ns, partner
-        self._max_bytes = MAX_WAITING_BYTES if is_live else math.inf
+        self._is_live = is_live
         self._ready: list[Paired] = []
         self._passed_ns: int | None = None  # the last stamp of stream 1 that was dealt with
         self.last_ns: int | None = -1 if is_live else None  # of the last pair
@@ -126,8 +126,9 @@ class _Answers:
 
     def is_crowded(self, n_waiting: int, images: Iterable[StampedImage | None]) -> bool:
         """Tell whether more wait than may, by their number or by their memory."""
-        n_bytes = sum(0 if image is None else image.n_bytes for image in images)
-        return n_waiting > _QUEUE_SIZE or n_bytes > self._max_bytes
+        if n_waiting > _QUEUE_SIZE or not self._is_live:
+            return n_waiting > _QUEUE_SIZE
+        return sum(image.n_bytes for image in images if image is not None) > MAX_WAITING_BYTES
 
     def is_late(self, image: StampedImage) -> bool:
         return self.last_ns is not None and image.stamp_ns <= self.last_ns

@@ -5,7 +5,6 @@ It needs foxglove-sdk (the extra `foxglove`).
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import threading
 from collections.abc import Sequence
@@ -19,9 +18,6 @@ from gvo.live.transport import Parameters, Publisher, Service
 try:
     import foxglove
     from foxglove.websocket import Capability, ChannelView, Client, ServerListener, WebSocketServer
-    from websockets.exceptions import WebSocketException
-    from websockets.sync.client import connect
-    from websockets.typing import Subprotocol
 except ImportError as error:
     raise missing_extra("--foxglove needs foxglove-sdk", "foxglove") from error
 
@@ -36,7 +32,6 @@ _N_BYTES_EMPTY = 5
 _PATIENCE_S = 2.0
 _NULL = "null"
 _STATUS = "parameters"
-_PROTOCOL = Subprotocol("foxglove.sdk.v1")
 
 
 class Foxglove:
@@ -81,9 +76,7 @@ class Foxglove:
                 "any, and an address of this machine"
             ) from error
         self._listener.server = self._server
-        self._changed, self._is_closed = threading.Event(), False
-        self._teller = threading.Thread(target=self._tell, name="foxglove", daemon=True)
-        self._teller.start()
+        self._is_closed = False
 
     @property
     def url(self) -> str:
@@ -119,30 +112,12 @@ class Foxglove:
     def offer(self, parameters: Parameters) -> None:
         """Let clients see and set parameters; one that is None appears as the text null."""
         self._listener.parameters = parameters
-        parameters.follow(lambda config: self._changed.set())
-
-    def _tell(self) -> None:
-        """Send all values to the clients after each change, by connecting as a client itself.
-
-        The SDK's own `publish_parameter_values` (0.30) can deadlock: it waits for a lock while it
-        holds Python's, and a subscription takes the two in the other order. After a client's
-        request that sets nothing the server publishes all values, without that risk.
-        """
-        while self._changed.wait() and not self._is_closed:
-            self._changed.clear()
-            with (
-                contextlib.suppress(OSError, WebSocketException),
-                connect(self.url, subprotocols=[_PROTOCOL], proxy=None) as client,
-            ):
-                client.send('{"op": "setParameters", "parameters": []}')
 
     def close(self) -> None:
         """Disconnect the clients and listen no more; a second call does nothing."""
         if self._is_closed:
             return
         self._is_closed = True
-        self._changed.set()
-        self._teller.join(_PATIENCE_S)
         # `stop` waits for ever for clients that connected and sent nothing.
         stopping = threading.Thread(target=self._server.stop, daemon=True)
         stopping.start()

@@ -208,7 +208,11 @@ class LiveOdometry:
             on_progress(state)
 
         result = run_recording(
-            ChosenImages(info=self._source.info, images=self._stretches.next_stretch),
+            ChosenImages(
+                info=self._source.info,
+                images=self._stretches.next_stretch,
+                camera_info_changes=getattr(self._source, "camera_info_changes", None),
+            ),
             folder,
             config=self.parameters.config,
             base_frame=self._base_frame,

@@ -23,7 +23,8 @@ from gvo.runs.outputs.frames import RunFrames
 from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Optimum, Status
 
 _EVERY_S: Final = 1.0
-_SILENT_S: Final = 3.0
+# Without images for so long a stream is said to have stopped.
+SILENT_S: Final = 3.0
 # Images and poses over which rates and latencies are computed.
 _N_RECENT: Final = 50
 # Pairs whose arrival is remembered until their pose is sent.
@@ -182,10 +183,10 @@ class Arrivals(AbstractContextManager["Arrivals"]):
         silent_s = [now_s - (times[-1] if times else self._started_s) for times in self._times_s]
         silent = int(silent_s[1] > silent_s[0])
         other = 1 - silent
-        if silent_s[silent] <= _SILENT_S:
+        if silent_s[silent] <= SILENT_S:
             return ""
         names, lasting = self._info.stream_names, f"for {silent_s[silent]:.0f} s"
-        if silent_s[other] > 0.5 * _SILENT_S:
+        if silent_s[other] > 0.5 * SILENT_S:
             return f"no images {lasting} on {self._topics[0]} and {self._topics[1]}"
         rate = _rate_hz(self._times_s[other])
         return (

@@ -20,7 +20,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, BinaryIO
+from typing import Any
 
 import cv2
 import numpy as np
@@ -54,52 +54,65 @@ _N_SHOWN = 80
 class StandardInput:
     """A camera whose images another program writes to standard input.
 
+    A thread that waits in a read of `sys.stdin` until the process ends would hold its lock, and
+    the interpreter aborts where it cannot close it: the descriptor is read.
+
     Parameters
     ----------
-    stream : binary file
-        Read to its end.
     info : RecordingInfo
         Of the camera: `gvo.Rig(...).info`.
     config : Config, optional
         Of which `images` and `depth.scale` are used.
     depth_scale : float, optional
         Counts per metre, if `config` has none; 1000 if omitted.
+    number : int
+        Of the file that is read to its end, as `fileno` has it.
     """
 
     def __init__(
         self,
-        stream: BinaryIO,
         info: RecordingInfo,
         config: Config | None = None,
         *,
         depth_scale: float | None = None,
+        number: int = 0,
     ) -> None:
         config = config or Config()
-        self.info, self._stream = replace(info, name=_WHERE), stream
+        self.info, self._file = replace(info, name=_WHERE), _EndableFile(number)
+        self._stream = io.BufferedReader(self._file)
         self._scale = config.depth.scale or depth_scale or MILLIMETRES
         self._grey_range = GreyRange(black=config.images.black, white=config.images.white)
 
     def images(self) -> Iterator[StampedImage]:
-        """Yield the images as they arrive.
+        """Yield the images as they arrive, until `close`.
 
         Raises
         ------
         RecordingError
             If a line is not a header, or the input ends within an image.
         """
-        while line := self._stream.readline(_MAX_LINE):
-            if not line.strip():
-                continue
-            header = _parse(line)
-            stream = self._stream_of(header)
-            stamp_ns = _whole(header, "stamp_ns", lowest=-(2**63), highest=2**63 - 1)
-            load = self._loader(header, is_depth=stream == 1 and self.info.sensor == "rgbd")
-            n_bytes = load.args[0].data.nbytes
-            yield StampedImage(stream=stream, stamp_ns=stamp_ns, load=load, n_bytes=n_bytes)
+        try:
+            while line := self._stream.readline(_MAX_LINE):
+                if line.strip():
+                    yield self._read_image(_parse(line))
+        except RecordingError:
+            if not self._file.is_ended:  # else the last image is cut there
+                raise
+
+    def close(self) -> None:
+        """End the images. Any thread may call it."""
+        self._file.end()
 
     def ground_truth(self) -> Trajectory | None:
         """Return None."""
         return None
+
+    def _read_image(self, header: dict[str, Any]) -> StampedImage:
+        stream = self._stream_of(header)
+        stamp_ns = _whole(header, "stamp_ns", lowest=-(2**63), highest=2**63 - 1)
+        load = self._loader(header, is_depth=stream == 1 and self.info.sensor == "rgbd")
+        n_bytes = load.args[0].data.nbytes
+        return StampedImage(stream=stream, stamp_ns=stamp_ns, load=load, n_bytes=n_bytes)
 
     def _stream_of(self, header: dict[str, Any]) -> int:
         names = ("left", "right") if self.info.sensor == "stereo" else ("color", "depth")
@@ -137,44 +150,6 @@ class StandardInput:
         if len(data) < size:
             raise RecordingError(f"{_WHERE}: ends after {len(data)} of {size} bytes of an image")
         return np.frombuffer(data, dtype=np.uint8)
-
-
-class ProcessInput(StandardInput):
-    """The standard input of this process, whose images another thread can end.
-
-    A thread that waits in a read of `sys.stdin` until the process ends would hold its lock, and
-    the interpreter aborts where it cannot close it.
-
-    Parameters
-    ----------
-    number : int
-        Of the file, as `fileno` has it.
-    info, config, depth_scale
-        As of `StandardInput`.
-    """
-
-    def __init__(
-        self,
-        number: int,
-        info: RecordingInfo,
-        config: Config | None = None,
-        *,
-        depth_scale: float | None = None,
-    ) -> None:
-        self._file = _EndableFile(number)
-        super().__init__(io.BufferedReader(self._file), info, config, depth_scale=depth_scale)
-
-    def images(self) -> Iterator[StampedImage]:
-        """Yield the images as they arrive, until `close`."""
-        try:
-            yield from super().images()
-        except RecordingError:
-            if not self._file.is_ended:  # else the last image is cut there
-                raise
-
-    def close(self) -> None:
-        """End the images. Any thread may call it."""
-        self._file.end()
 
 
 class _EndableFile(io.RawIOBase):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from functools import partial
@@ -25,6 +26,7 @@ from gvo.io.calibration.files import CalibrationPaths
 from gvo.io.poses.tf import TF_TYPES, TfBuffer, read_tf
 from gvo.io.recording import StampedImage
 from gvo.io.sync import MAX_WAITING_BYTES
+from gvo.live.publishing import SILENT_S
 from gvo.live.transport import Transport
 
 _SMALL = (CAMERA_INFO_TYPE, *TF_TYPES)
@@ -181,14 +183,26 @@ class TopicSource(BagSource):
         self._open(reader, reader.transport.name, topics, calibration, config)
 
     def images(self) -> Iterator[StampedImage]:
-        """Yield images as they arrive, until `close`."""
+        """Yield images as they arrive, until `close`.
+
+        Raises
+        ------
+        RecordingError
+            At the end, if a topic has been silent for three seconds then.
+        """
         stamps = ImageStamps()
+        came_s: dict[str, float] = {}
         for message in self._network.messages(self._info_names):
             self._watch.take(message)
         self._network.on_small = self._watch_info
         for message in self._network.images():
-            if message.topic.name in self.image_topics:
-                yield self._stamped(message, self.image_topics.index(message.topic.name), stamps)
+            name = message.topic.name
+            if name in self.image_topics:
+                came_s[name] = time.monotonic()
+                yield self._stamped(message, self.image_topics.index(name), stamps)
+        for name, last_s in came_s.items():
+            if (silent_s := time.monotonic() - last_s) > SILENT_S:
+                raise RecordingError(f"{name}: no images in the last {silent_s:.0f} s")
 
     def _watch_info(self, message: BagMessage) -> None:
         """Compare a `CameraInfo` with the one that is used; say so once where it differs."""

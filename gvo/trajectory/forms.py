@@ -115,6 +115,7 @@ FORMS = (
     Form("TUM in nanoseconds", (8,), "ns", _X_FIRST),
     Form("ORB-SLAM3", (8,), "ns.", _X_FIRST, ("",)),
     Form("EuRoC", (8, 17), "ns", _W_FIRST),
+    Form("OKVIS", (17,), "ns", _X_FIRST, ("", ", ")),
     Form("VINS", (8, 11), "ns", _W_FIRST, (",,",)),
     Form("OpenVINS", range(17, 10_000), "s.", "stamp qx qy qz qw x y z", ("",)),
     Form("OpenVINS", (20,), "s.", _X_FIRST, ("",)),

@@ -1,6 +1,5 @@
 """Odometry of a camera that is running: what waits, what is dropped, pipes and devices."""
 
-import io
 import json
 import os
 import signal
@@ -9,6 +8,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import cv2
@@ -17,7 +17,7 @@ import pytest
 
 import gvo
 from gvo.errors import RecordingError
-from gvo.io.recording import StampedImage
+from gvo.io.recording import RecordingInfo, StampedImage
 from gvo.io.sync import Pair
 from gvo.live.odometry import LiveOdometry, WaitingPairs
 from gvo.live.sources import Device, StandardInput
@@ -29,6 +29,14 @@ from tests.live.pipe import LiveCommand, sent, write_calibration
 TIED = Progress(n_done=3, n_total=0, n_tracked=2)
 NO_REPORT = gvo.RunOutputs(report=False)
 MILLISECOND_NS = 1_000_000
+
+
+def piped(data: bytes, info: RecordingInfo) -> StandardInput:
+    """Return what reads these bytes from a file."""
+    with TemporaryFile() as file:
+        file.write(data)
+        file.seek(0)
+        return StandardInput(info, number=os.dup(file.fileno()))
 
 
 def pair(stamp_ms: int) -> Pair:
@@ -121,7 +129,7 @@ def test_where_nothing_is_dropped_the_poses_are_those_of_a_run(
     name: str, compressed: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     source = gvo.open_recording(request.getfixturevalue(f"{name}_bag"))
-    pipe = StandardInput(io.BytesIO(sent(source, compressed=compressed)), source.info)
+    pipe = piped(sent(source, compressed=compressed), source.info)
     live = LiveOdometry(pipe, max_waiting=1000)
     ((folder, result),) = live.run(tmp_path / "live", outputs=NO_REPORT)
     assert result.is_complete
@@ -205,7 +213,7 @@ def test_a_run_goes_on_where_nobody_reads_what_it_says(
     ],
 )
 def test_what_is_no_image_ends_in_one_line(header: bytes, fault: str, drive_bag: Path) -> None:
-    pipe = StandardInput(io.BytesIO(header), gvo.open_recording(drive_bag).info)
+    pipe = piped(header, gvo.open_recording(drive_bag).info)
     with pytest.raises(RecordingError, match=fault) as raised:
         list(pipe.images())
     assert len(str(raised.value)) < 400
@@ -229,7 +237,7 @@ def test_a_stream_without_an_image_is_named(
 
 def test_a_stream_that_breaks_off_keeps_what_was_tracked(drive_bag: Path, tmp_path: Path) -> None:
     source = gvo.open_recording(drive_bag)
-    pipe = StandardInput(io.BytesIO(sent(source)[:-1000]), source.info)
+    pipe = piped(sent(source)[:-1000], source.info)
     ((_, result),) = LiveOdometry(pipe, max_waiting=1000).run(tmp_path / "out", outputs=NO_REPORT)
     assert not result.is_complete
     assert any("ends after" in line for line in result.warnings)
@@ -300,6 +308,9 @@ def test_a_camera_that_vanishes_is_told(
         (("camera", "a", "b", "c"), "side by side, or two"),
         (("camera", "a", "--sensor=rgbd"), "has no depth"),
         (("camera", "²"), "OpenCV opens no camera or film"),
+        (("-", "--left=/left"), "-: --left chooses a topic"),
+        (("camera", "a", "--camera-info=/info"), "camera: --camera-info chooses a topic"),
+        (("-", "--qos=system"), "--qos: only ROS 2"),
         (("-", "--queue=0"), "max_waiting >= 1"),
         (("-", "--max-lag=nan"), "max_lag_s > 0"),
     ],

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 import gvo
 from gvo.config import Config
-from gvo.errors import ConfigurationError
+from gvo.errors import ConfigurationError, RecordingError
 from gvo.geometry import se3
 from gvo.io.bag.messages import stamp_of, transform_of
 from gvo.io.bag.reader import BagMessage, BagReader, serialize, typestore
@@ -57,6 +57,7 @@ class Play:
         self._thread.start()
         source = wait_for(lambda: TopicSource(self.reader), self.said.append, threading.Event())
         assert source is not None
+        self.source = source
         options = {"max_waiting": 1000, "say": self.said.append, **options}
         self.live = LiveOdometry(source, sinks=[self.network], **options)
 
@@ -506,8 +507,23 @@ def test_a_camera_info_that_changes_is_told_once(
             data = serialize(content, message.topic.type, is_ros1=message.is_ros1)
             play.network.send(replace(message, data=data))
 
-    Play(drive_bag, script).run(tmp_path / "out")
+    ((_, result),) = Play(drive_bag, script).run(tmp_path / "out")
     assert caplog.text.count("camera_info changes on the way: the first one is used") == 1
+    assert result.is_complete
+    assert any("CameraInfo changes on the way (" in line for line in result.warnings)
+
+
+def test_a_run_is_not_complete_if_its_camera_has_vanished_at_its_end(
+    drive_bag: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    images = Play(drive_bag).source.images()
+    now_s = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    for _ in range(2 * N_FRAMES):
+        next(images)
+    now_s += 4.0
+    with pytest.raises(RecordingError, match=r"/stereo/left.*: no images in the last 4 s"):
+        next(images)
 
 
 def test_a_stream_that_stops_is_told_with_the_rate_of_the_other(

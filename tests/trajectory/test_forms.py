@@ -87,7 +87,10 @@ SYSTEMS: dict[str, list[tuple[str, Row]]] = {
     "EuRoC": [
         (EUROC, lambda k: f"{STAMPS_NS[k]},{position(k, ',')},{wxyz(k, ',')},{state(9, ',')}"),
         ("", lambda k: f"{STAMPS_NS[k]},{position(k, ',')},{wxyz(k, ',')},{state(9, ',')}"),
-        ("", lambda k: f"{STAMPS_NS[k]}, {position(k, ', ')}, {wxyz(k, ', ')}, {state(9, ', ')}"),
+        (
+            EUROC,
+            lambda k: f"{STAMPS_NS[k]}, {position(k, ', ')}, {wxyz(k, ', ')}, {state(9, ', ')}",
+        ),
     ],
     "VINS": [
         ("", lambda k: f"{STAMPS_NS[k]},{position(k, ',')},{wxyz(k, ',')},{state(3, ',')},"),
@@ -220,6 +223,11 @@ def test_a_header_decides(tmp_path: Path, header: str, row: Row) -> None:
             "",
             lambda k: f"{STAMPS_NS[k]},{position(k, ',')},{wxyz(k, ',')}",
             r":1: 8 columns.*fits TUM in nanoseconds \(.* and EuRoC \(.*; name the columns",
+        ),
+        (
+            "",
+            lambda k: f"{STAMPS_NS[k]}, {position(k, ', ')}, {xyzw(k, ', ')}, {state(9, ', ')}",
+            r":1: 17 columns.*fits EuRoC \(.* and OKVIS \(.*; name the columns",
         ),
         (
             "x y z qx qy qz qw id stamp\n",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -307,6 +307,5 @@ def read_transforms(source: Source, frames: Collection[str]) -> TfBuffer | None:
 
 def describe_camera_changes(source: Source) -> str | None:
     """Say which `CameraInfo` of the images read differ from the one used; None for no bag."""
-    if not isinstance(source, BagSource):
-        return None
-    return ", ".join(f"{n} of {name}" for name, n in source.camera_info_changes.items())
+    changes: Mapping[str, int] | None = getattr(source, "camera_info_changes", None)
+    return None if changes is None else ", ".join(f"{n} of {name}" for name, n in changes.items())

@@ -136,8 +136,12 @@ def _of_chain(content: Content, path: Path) -> Iterable[DescribedCamera]:
 
 
 def _of_pair(content: Content, path: Path) -> Iterable[DescribedCamera]:
+    """Read a pair; raw cameras of ORB-SLAM without P are those of its camera and its `bf`."""
     names = ("left", "right") if _part(content, "left") else ("LEFT", "RIGHT")
-    return [_described(_part(content, name), f"{path}: {name}") for name in names]
+    sides = {name: _part(content, name) for name in names}
+    if "bf" in _part(content, "Camera") and not any("P" in side for side in sides.values()):
+        return _rectified_to_camera(content, path, sides)
+    return [_described(side, f"{path}: {name}") for name, side in sides.items()]
 
 
 def _of_slam(content: Content, path: Path) -> Iterable[DescribedCamera]:
@@ -153,14 +157,28 @@ def _of_slam(content: Content, path: Path) -> Iterable[DescribedCamera]:
 
 def _of_rectifier(content: Content, path: Path) -> Iterable[DescribedCamera]:
     """Read the raw pair that stella_vslam rectifies to its camera."""
+    rectifier = _part(content, "StereoRectifier")
+    sides = {
+        f"{side} of StereoRectifier": {
+            str(key).removesuffix(f"_{side}"): value for key, value in rectifier.items()
+        }
+        for side in ("left", "right")
+    }
+    return _rectified_to_camera(content, path, sides)
+
+
+def _rectified_to_camera(
+    content: Content, path: Path, sides: Mapping[str, Content]
+) -> Iterable[DescribedCamera]:
     camera, *_ = _of_slam(content, path)
-    rectifier, fields = _part(content, "StereoRectifier"), camera.fields
-    for side, factor in (("left", 0.0), ("right", -1.0)):
-        offset = [[factor * (camera.focal_x_baseline or 0.0)], [0.0], [0.0]]
-        raw = {str(key).removesuffix(f"_{side}"): value for key, value in rectifier.items()}
-        P = np.hstack([np.reshape(fields.K, (3, 3)), offset])
-        raw |= {"P": P, "resolution": (fields.width, fields.height)}
-        yield _described(raw, f"{path}: {side} of StereoRectifier")
+    fields, offset = camera.fields, 0.0
+    for name, side in sides.items():
+        if _first(side, _KEYS["R"]) is None:
+            raise CalibrationError(f"{path}: {name} lacks R, its rotation to the rectified camera")
+        P = np.hstack([np.reshape(fields.K, (3, 3)), [[offset], [0.0], [0.0]]])
+        size = {"cols": fields.width, "rows": fields.height}
+        yield _described({**size, **side, "P": P}, f"{path}: {name}")
+        offset = -(camera.focal_x_baseline or 0.0)
 
 
 def _of_one(content: Content, path: Path) -> Iterable[DescribedCamera]:

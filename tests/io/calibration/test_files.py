@@ -154,13 +154,15 @@ def _orb_slam3(path: Path, model: str, *, is_old: bool = False) -> Path:
     return _write(path, f"{text}{size}Stereo.ThDepth: 60.0\nStereo.T_c1_c2: {_matrix(T)}")
 
 
-def _orb_slam2(path: Path, model: str) -> Path:
+def _orb_slam2(path: Path, model: str, matrices: str = "DKRP") -> Path:
     """Write the settings of ORB-SLAM2 of a pair that it rectifies."""
-    K = _rig(model)[0].P
+    K = _rig(model)[0].P.astype(object)  # of Python's numbers, whose repr is plain
     text = f"%YAML:1.0\nCamera.fx: {K[0, 0]!r}\nCamera.fy: {K[0, 0]!r}\nCamera.width: {_SIZE[0]}\n"
+    text += f"Camera.cx: {K[0, 2]!r}\nCamera.cy: {K[1, 2]!r}\n"
+    text += f"Camera.bf: {float(-_rig(model)[1].P[0, 3])!r}\n"
     for side, camera in zip(("LEFT", "RIGHT"), _rig(model), strict=True):
         text += f"{side}.height: {_SIZE[1]}\n{side}.width: {_SIZE[0]}\n"
-        text += "".join(f"{side}.{name}: {_matrix(getattr(camera, name))}" for name in "DKRP")
+        text += "".join(f"{side}.{name}: {_matrix(getattr(camera, name))}" for name in matrices)
     return _write(path, text)
 
 
@@ -260,6 +262,7 @@ def test_the_files_of_one_rig_give_one_calibration(tmp_path: Path, model: str) -
     if model == "plumb_bob":
         sets["opencv"] = _opencv(tmp_path / "opencv.yaml", model)
         sets["orb-slam2"] = _orb_slam2(tmp_path / "orb2.yaml", model)
+        sets["orb-slam2 without P"] = _orb_slam2(tmp_path / "bf.yaml", model, "DKR")
     for name, paths in sets.items():
         found = _stereo(paths, size=_SIZE)
         for calibration, expected in zip(found.calibrations, _rig(model), strict=True):
@@ -394,6 +397,10 @@ def test_an_rgbd_camera_has_the_factor_of_its_depth(
         ("Camera: 1\n", "ORB-SLAM: lacks"),
         ("Camera: 1\nCamera.fx: 1\n", "ORB-SLAM: lacks"),
         ("P0: 1 2\nP1: 1 2\n", "P0: P must hold 12 numbers, got 2"),
+        (
+            f"{_dotted('Camera.')}Camera.bf: 9.0\n{_dotted('LEFT.')}{_dotted('RIGHT.')}",
+            "LEFT lacks R, its rotation",
+        ),
     ],
 )
 def test_what_is_not_supported_is_refused_by_name(tmp_path: Path, text: str, message: str) -> None:
