@@ -394,7 +394,8 @@ def convert_(
     parameters: opt.Parameters,
 ) -> None:
     """Write a recording as a bag, or as a folder of KITTI, EuRoC or TUM."""
-    from gvo.io.convert.convert import check_new, convert
+    from gvo.io.convert.convert import convert
+    from gvo.io.run_folder.line_file import check_new
 
     check_new(target)
     source = opt.open_source(recordings, parameters, options)

@@ -105,7 +105,12 @@ def take_excerpt(items: Iterable[Paired], excerpt: Excerpt) -> Iterator[Paired]:
         n_to_skip = excerpt.every - 1 if is_pair else 0
         yield item
     if stamps and not n_given:
-        raise RecordingError(_empty_text(excerpt, (stamps[1] - stamps[0]) / 1e9))
+        length_s = (stamps[1] - stamps[0]) / 1e9
+        until = "" if excerpt.duration_s is None else f" and for {excerpt.duration_s:g} s"
+        raise RecordingError(
+            f"no frame at {excerpt.start_s:g} s or later{until}: the recording is {length_s:g} s "
+            "long, or has a gap there; start elsewhere or take more"
+        )
 
 
 def _place(since_first_ns: int, excerpt: Excerpt) -> Literal["before", "within", "after"]:
@@ -115,16 +120,3 @@ def _place(since_first_ns: int, excerpt: Excerpt) -> Literal["before", "within",
     if excerpt.duration_s is None or since_first_ns < start_ns + round(excerpt.duration_s * 1e9):
         return "within"
     return "after"
-
-
-def _empty_text(excerpt: Excerpt, read_s: float) -> str:
-    if excerpt.duration_s is None or read_s < excerpt.start_s:
-        return (
-            f"no frame at {excerpt.start_s:g} s or later: the recording is {read_s:g} s long; "
-            "start earlier"
-        )
-    return (
-        f"no frame between {excerpt.start_s:g} and {excerpt.start_s + excerpt.duration_s:g} s: "
-        f"the recording has a gap there and goes on to {read_s:g} s or longer; start elsewhere "
-        "or take more"
-    )

@@ -13,13 +13,20 @@ import gvo
 from gvo.errors import RecordingError
 from gvo.geometry.camera import Calibration
 from gvo.io.recording import RecordingInfo, Sensor, Source, StampedImage
-from gvo.io.synthetic import SyntheticRecording
+from gvo.io.synthetic import SensorNoise, SyntheticRecording
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame, Frame
 
 Item = tuple[int, int, NDArray[Any] | Exception]
 """Stream, stamp, and pixels or what loading raises."""
 Change = Callable[[NDArray[Any]], NDArray[Any]]
+_NONE = ("grey_sigma", "exposure_drift", "exposure_mismatch", "depth_sigma", "depth_step")
+PERFECT = SensorNoise(
+    **dict.fromkeys((*_NONE, "hole_share", "min_depth_m"), 0.0),
+    edge_radius_px=0,
+    max_depth_m=float("inf"),
+)
+"""A sensor without noise or limits."""
 
 
 @dataclass(eq=False)

@@ -19,6 +19,7 @@ from gvo.io.convert.folders import EurocForm, KittiForm, TumForm
 from gvo.io.convert.plan import Form, Plan
 from gvo.io.opening import BAG_SUFFIXES
 from gvo.io.recording import RecordingInfo, Source
+from gvo.io.run_folder.line_file import check_new
 
 Layout: TypeAlias = Literal["bag", "kitti", "euroc", "tum"]
 
@@ -134,14 +135,6 @@ def convert(
             form.finish()
         form.path.rename(path)
     return Conversion(path=path, n_images=sum(n_images), n_poses=form.n_poses, skipped=plan.skipped)
-
-
-def check_new(path: Path) -> None:
-    """Refuse a target that exists, or whose folder does not."""
-    if path.exists():
-        raise RecordingError(f"{path}: exists already; give another path or remove it")
-    if not path.parent.is_dir():
-        raise RecordingError(f"{path}: cannot be written: {path.parent} is no folder")
 
 
 def _check(path: Path, layout: Layout | None, *, compress: bool) -> None:

@@ -63,21 +63,6 @@ class SensorNoise:
         if min(sizes) < 0 or not 0 <= self.hole_share < 1:
             raise ValueError(f"sigmas must not be negative, shares in [0, 1): {self}")
 
-    @classmethod
-    def none(cls) -> SensorNoise:
-        """Return a perfect sensor."""
-        return cls(
-            grey_sigma=0.0,
-            exposure_drift=0.0,
-            exposure_mismatch=0.0,
-            depth_sigma=0.0,
-            depth_step=0.0,
-            hole_share=0.0,
-            edge_radius_px=0,
-            min_depth_m=0.0,
-            max_depth_m=np.inf,
-        )
-
 
 def expose(
     grey: DepthArray, noise: SensorNoise, rng: np.random.Generator, *, stream: int, elapsed_s: float

@@ -24,9 +24,9 @@ from gvo.io.synthetic import (
     make_scene,
 )
 from gvo.types import BoolArray, DepthArray, FloatArray
+from tests.make.recordings import PERFECT
 
 WORLDS = ["driving", "handheld"]
-PERFECT = SensorNoise.none()
 
 
 def perfect(world: Any, sensor: Any = "stereo", **options: Any) -> SyntheticRecording:

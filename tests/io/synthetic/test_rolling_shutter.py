@@ -7,17 +7,15 @@ import pytest
 
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.se3 import make_transform
-from gvo.io.synthetic import (
-    SensorNoise,
-    SyntheticRecording,
-)
+from gvo.io.synthetic import SyntheticRecording
 from gvo.io.synthetic.world import WORLDS
+from tests.make.recordings import PERFECT
 
 
 @pytest.mark.parametrize(("name", "sensor"), [("driving", "stereo"), ("handheld", "rgbd")])
 def test_each_row_is_that_of_an_image_taken_at_its_stamp(name: Any, sensor: Any) -> None:
     recording = SyntheticRecording(
-        name, sensor, n_frames=12, noise=SensorNoise.none(), scale=0.25, readout_ms=30.0
+        name, sensor, n_frames=12, noise=PERFECT, scale=0.25, readout_ms=30.0
     )
     camera, scene = recording.info.camera, WORLDS[name].scene(0)
     loaded = [image.load() for image in list(recording.images())[-2:]]
