@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 import json
 import math
 import os
@@ -14,7 +13,7 @@ from itertools import product
 from pathlib import Path
 from typing import TypeVar
 
-from gvo._text import YamlError, cut, load_yaml, text_lines
+from gvo._text import YamlError, cut, load_yaml
 from gvo.batch.results import CSV
 from gvo.batch.tasks import MARK, Value
 from gvo.config import Config, RuntimeConfig, load_configuration, values_by_name
@@ -25,17 +24,13 @@ from gvo.io.run_folder.writer import REPORT
 T = TypeVar("T")
 _UNSAFE = re.compile(r"[^A-Za-z0-9._=,+-]+")
 _MAX_NAME = 150
-_LIST_SUFFIX = ".txt"
-_PATTERN = re.compile(r"[*?\[]")
 # Depth of the search: a link to a parent folder must end somewhere.
 _MAX_DEPTH = 12
 _COMPRESSED = ".zstd"
-_COMMENT = re.compile(r"(^|\s)#.*")
 # The batch's own files, also while they are written.
 _TAKEN = {f"{name}{end}" for name in (CSV, REPORT, MARK) for end in ("", ".new")}
 DEFAULT = "default"
 _MAX_SHOWN = 100
-_MAX_LISTED = 1_000_000  # lines of a list of recordings
 _MAX_VARIANTS = 100_000
 
 
@@ -61,10 +56,8 @@ def find_recordings(asked: Sequence[str | Path]) -> list[NamedRecording]:
     Parameters
     ----------
     asked : sequence of str or Path
-        Each a path of a recording; a pattern (`*`, `?`, `[`, `**`); a folder, which is searched
-        unless it is a recording itself; or a `.txt` file with one of these per line, relative to
-        its folder, with comments after `#`. A path that does not exist is taken for a recording
-        that only the workers see.
+        Each a path of a recording, or a folder, which is searched unless it is a recording itself.
+        A path that does not exist is taken for a recording that only the workers see.
 
     Raises
     ------
@@ -77,41 +70,13 @@ def find_recordings(asked: Sequence[str | Path]) -> list[NamedRecording]:
         raise ValueError("expected at least one recording")
     locations: dict[str, None] = {}
     for one in asked:
-        path = Path(one)
-        is_list = path.suffix == _LIST_SUFFIX and path.is_file()
-        found = list(_read_list(path) if is_list else _search(str(one)))
+        # Links are not resolved: on a worker they may lead elsewhere.
+        place = Path(os.path.abspath(Path(one).expanduser()))  # noqa: PTH100
+        found = [*map(str, _search_below(place))]
         if not found:
             raise RecordingError(f"{one}: no recording there")
         locations.update(dict.fromkeys(found))
     return _name(list(locations))
-
-
-def _read_list(path: Path) -> Iterator[str]:
-    for number, line in text_lines(path, RecordingError, max_lines=_MAX_LISTED):
-        entry = _COMMENT.sub("", line).strip()
-        if not entry:
-            continue
-        found = list(_search(str(path.parent / entry)))
-        if not found:
-            raise RecordingError(f"{path}, line {number}: {entry}: no recording there")
-        yield from found
-
-
-def _search(text: str) -> Iterator[str]:
-    """Yield the recordings that a path, a pattern or a folder leads to."""
-    # Links are not resolved: on a worker they may lead elsewhere.
-    place = Path(os.path.abspath(Path(text).expanduser()))  # noqa: PTH100
-    if not _PATTERN.search(str(place)) or place.exists():
-        yield from map(str, _search_below(place))
-        return
-    taken: set[Path] = set()
-    for match in map(Path, sorted(glob.glob(str(place), recursive=True))):  # noqa: PTH207
-        # The files inside a recording that is a folder are not recordings.
-        is_inside = not taken.isdisjoint(match.parents)
-        if not is_inside and (match.is_dir() or _is_bag(match.name)):
-            found = list(_search_below(match))
-            taken.update(found)
-            yield from map(str, found)
 
 
 def _search_below(place: Path, depth: int = 0) -> Iterator[Path]:

@@ -44,7 +44,7 @@ def run(
     Parameters
     ----------
     recordings : path, or sequence of paths
-        Recordings, patterns, folders, lists; see `find_recordings`.
+        Recordings, or folders of them; see `find_recordings`.
     configs : Config, sequence, or mapping of names, optional
         The defaults if omitted, except `runtime.threads`, which is 1: each core has a run.
     out : str or Path

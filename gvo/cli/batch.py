@@ -26,7 +26,7 @@ _MAX_WARNINGS = 20
 def batch(
     recordings: Annotated[
         list[str],
-        Argument(metavar="RECORDING...", help="Paths, patterns, folders, lists (.txt)."),
+        Argument(metavar="RECORDING...", help="Recordings, or folders to search."),
     ],
     out: Annotated[Path, Option(metavar="DIR", help="Folder to write.")],
     *,
@@ -102,14 +102,7 @@ def _sort_arguments(recordings: list[str], configs: list[str]) -> tuple[list[str
     rest = [one for one in recordings if not one.endswith(_CONFIGURATIONS)]
     if not rest:
         raise ConfigurationError("expected a recording beside the configurations")
-    files: list[Path] = []
-    for pattern in given:
-        path = Path(pattern)
-        matches = [path] if path.exists() else sorted(path.parent.glob(path.name))
-        if not matches:
-            raise ConfigurationError(f"{pattern}: no such configuration")
-        files += matches
-    return rest, files
+    return rest, [Path(one) for one in given]
 
 
 @contextmanager

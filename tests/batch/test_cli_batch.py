@@ -69,10 +69,9 @@ def test_all_failed_is_2(batch: Batch, tmp_path: Path) -> None:
 def test_configurations_and_sweeps_are_all_pairs(batch: Batch, bags: Path, here: Path) -> None:
     for name, size in (("a", 3), ("b", 4)):
         (here / f"{name}.yaml").write_text(f"window: {{size: {size}}}\n")
-    (here / "list.txt").write_text(f"{bags}/walk0.mcap # of many\n")
     # As the shell expands a pattern without quotes.
     options = ["--sweep", "window.n_links=1,2", "--no-loops", "--every", "2"]
-    answer = batch("list.txt", "--out", "out", "--configs", "a.yaml", "b.yaml", *options)
+    answer = batch(bags / "walk0.mcap", "--out", "out", "--configs", "a.yaml", "b.yaml", *options)
     assert answer.code == 0, answer.err
     table = pd.read_csv("out/results.csv")
     values = list(zip(table["window.size"], table["window.n_links"], strict=True))
@@ -114,9 +113,8 @@ def test_a_batch_does_not_take_runs_out_of_a_table(
     [
         (["--sweep", "window.sise=3,4"], "did you mean window.size"),
         (["--set", "window.size=1"], "greater than or equal to 2"),
-        (["--configs", "none.yaml"], "none.yaml: no such configuration"),
+        (["--configs", "none.yaml"], "none.yaml: No such file"),
         (["--workers", "2", "--scheduler", "tcp://127.0.0.1:1"], "--scheduler names a cluster"),
-        (["*.nothing"], "no recording there"),
     ],
 )
 def test_misuse_is_a_line_before_anything_begins(
