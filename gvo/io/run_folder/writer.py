@@ -60,7 +60,7 @@ _RESULTS = (
     *(TRUTH, TRUE_POSITIONS, GRAPH, LOOPS, f"{GLOBAL}.txt"),
     "frames.csv",
     *(f"{name}.txt" for name in TRAJECTORIES),
-    "explanation.json",
+    "explanation.html",
 )
 
 

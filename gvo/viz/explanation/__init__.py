@@ -1,4 +1,4 @@
-"""An explained frame as pictures, numbers and a page."""
+"""An explained frame as pictures and a page."""
 
 from gvo.viz.explanation.write import write_explanation
 

@@ -60,7 +60,7 @@ def test_a_link_leads_nowhere(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["summary.json", "smoothed.txt", "frames.csv", "report.html", "explanation.json"]
+    "name", ["summary.json", "smoothed.txt", "frames.csv", "report.html", "explanation.html"]
 )
 def test_a_folder_with_an_earlier_result_is_refused(tmp_path: Path, name: str) -> None:
     check_unused(tmp_path)
