@@ -18,6 +18,11 @@ from gvo.types import FloatArray
 
 Sensor = Literal["stereo", "rgbd"]
 
+OTHER_SIZE = (
+    "give that of these images by --calibration FILE, unless they were cut out of larger ones"
+)
+"""What to do where a camera is calibrated for images of another size."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StampedImage:

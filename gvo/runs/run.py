@@ -21,7 +21,7 @@ from gvo.io.frames import Through
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.poses.inputs import recorded_truth
 from gvo.io.poses.truth import Truth, TruthComparison, initial_pose
-from gvo.io.recording import Source
+from gvo.io.recording import OTHER_SIZE, Source
 from gvo.io.run_folder.reader import read_run, trajectory_names
 from gvo.io.run_folder.writer import GLOBAL, PICTURE, REPORT, RunFolder, save_summary, written_alone
 from gvo.runs.loop import Output, RunLoop, motions_of_window
@@ -257,7 +257,7 @@ def _within(truth: Truth, folder: RunFolder, loop: RunLoop) -> Truth:
 
 def _warnings_of_camera(source: Source) -> Iterator[str]:
     if source.info.doubt:
-        yield source.info.doubt
+        yield f"{source.info.doubt}; {OTHER_SIZE}"
     if changes := describe_camera_changes(source):
         yield f"CameraInfo changes on the way ({changes}): {CAMERA_CHANGED}"
 

@@ -250,6 +250,7 @@ def test_check_and_run_tell_of_a_calibration_for_images_of_another_size(
     told = f"K fits an image of {2 * camera.width}x{2 * camera.height}, the image is "
     answer = command("run", room_bag, "--out", tmp_path / "out", *options)
     assert (answer.code, answer.err.count(f"gvo: warning: colour: {told}")) == (0, 1)
+    assert told not in " ".join(answer.out.split())
     answer = command("check", room_bag, *options[:2])
     said = " ".join(answer.out.split())
     assert (answer.code, said.count(told), said.count("factor 0.5")) == (1, 1, 1)
@@ -279,13 +280,13 @@ def test_smooth_writes_and_compares(command: Command, tmp_path: Path, options: l
     }
 
 
-def test_smooth_tells_what_a_pose_graph_began_at(command: Command, tmp_path: Path) -> None:
+def test_smooth_tells_the_error_of_a_pose_graph(command: Command, tmp_path: Path) -> None:
     edge = "EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1\n"
     path = tmp_path / "graph.g2o"
     path.write_text(edge)
     answer = command("smooth", path, "--out", tmp_path / "out", "--robust", "gnc")
     assert answer.code == 0, answer.err
-    assert "error 0 after 1 iterations; start: odometry 0" in answer.out
+    assert "error 0 after 1 iterations" in answer.out
     assert "2 poses, 1 edges" in answer.out
     assert (tmp_path / "out/smoothed.g2o").read_text().splitlines()[-1] == edge.strip()
 

@@ -20,7 +20,7 @@ from gvo.errors import CalibrationError
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.io.bag.source import CAMERA_CHANGED, describe_camera_changes
 from gvo.io.poses.tf import TfBuffer
-from gvo.io.recording import RecordingInfo, Source
+from gvo.io.recording import OTHER_SIZE, RecordingInfo, Source
 from gvo.types import Failure
 
 # Frames that are decoded, each with its successor: a check takes seconds, whatever the length.
@@ -139,9 +139,10 @@ def _describe_camera(camera: PinholeCamera | Failure, doubt: str) -> Iterator[Fi
         )
         return
     if doubt:
-        value, _, fix = doubt.partition("; ")
         threshold = "principal point near the centre"
-        yield judged("K", value, is_ok=False, threshold=threshold, otherwise="fault", fix=fix)
+        yield judged(
+            "K", doubt, is_ok=False, threshold=threshold, otherwise="fault", fix=OTHER_SIZE
+        )
     view_deg = np.degrees(2.0 * np.arctan(0.5 * camera.width / camera.fx))
     yield Finding(name="focal length", value=f"{camera.fx:.1f} px, view of {view_deg:.0f} deg")
     if isinstance(camera, StereoCamera):

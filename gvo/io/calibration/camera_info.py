@@ -173,8 +173,7 @@ def _doubt(name: str, K: FloatArray, fields: CameraFields) -> str:
     what = "image" if fields.binning_factors == (1, 1) else "image before binning"
     return (
         f"{name} fits an image of {width}x{height}, the {what} is {size[0]}x{size[1]}"
-        f"{f': factor {factor:.3g}' if is_even else ''}; give that of these images by "
-        "--calibration FILE, unless they were cut out of larger ones"
+        f"{f': factor {factor:.3g}' if is_even else ''}"
     )
 
 

@@ -152,12 +152,12 @@ _QUARTER = RegionOfInterest(x_offset=320, y_offset=240, width=320, height=240)
 @pytest.mark.parametrize(
     ("size", "focal", "centre", "changes", "doubt"),
     [
-        ((320, 240), 525, (319.5, 239.5), {}, "of 640x480, the image is 320x240: factor 0.5;"),
-        ((320, 240), 525, (325.1, 249.7), {}, "of 640x480, the image is 320x240: factor 0.5;"),
-        ((640, 480), 262, (160.0, 120.0), {}, "of 320x240, the image is 640x480: factor 2;"),
-        ((640, 480), 262, (160, 120), {"binning": (2, 2)}, "before binning is 640x480: factor 2;"),
-        ((640, 360), 650, (480.2, 268.1), {}, "of 960x540, the image is 640x360: factor 0.667;"),
-        ((640, 480), 900, (639.5, 359.5), {}, "of 1280x720, the image is 640x480; give that"),
+        ((320, 240), 525, (319.5, 239.5), {}, "of 640x480, the image is 320x240: factor 0.5"),
+        ((320, 240), 525, (325.1, 249.7), {}, "of 640x480, the image is 320x240: factor 0.5"),
+        ((640, 480), 262, (160.0, 120.0), {}, "of 320x240, the image is 640x480: factor 2"),
+        ((640, 480), 262, (160, 120), {"binning": (2, 2)}, "before binning is 640x480: factor 2"),
+        ((640, 360), 650, (480.2, 268.1), {}, "of 960x540, the image is 640x360: factor 0.667"),
+        ((640, 480), 900, (639.5, 359.5), {}, "of 1280x720, the image is 640x480"),
         # cameras as they are: KITTI, EuRoC, freiburg1, KAIST, rectified TUM-VI; with a region
         ((1241, 376), 718, (607.19, 185.22), {}, ""),
         ((752, 480), 457, (379.999, 255.238), {}, ""),
