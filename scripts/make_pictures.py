@@ -180,7 +180,7 @@ def view(task: Task) -> Picture | None:
     truth = gvo.open_recording(task.bag).ground_truth()
     with (
         Player(lambda config: gvo.open_recording(task.bag, config=config), Config()) as player,
-        serve(player, port=0, truth=truth, name=task.bag.name) as page,
+        serve(player, port=0, truth=truth) as page,
     ):
         for _ in range(task.frame):  # the page itself asks for the first one
             player.step()

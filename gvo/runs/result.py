@@ -63,14 +63,8 @@ def _smoothing_words(summary: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _error_words(batch: Mapping[str, Any]) -> str:
-    """Return the error of a batch optimization and the errors of its starts, as text."""
+    """Return the error of a batch optimization as text."""
     if "error_isam2" in batch:
         return f"error {batch['error_isam2']:.6g} by iSAM2, {batch['error']:.6g} in a batch"
-    starts = batch["errors_of_starts"]
-    others = (f"{name} {error:.6g}" for name, error in starts.items() if name != batch["start"])
-    first = f"{batch['start']} {starts[batch['start']]:.6g}"
     refused = f", {batch['refused_edges']} edges refused" if batch["refused_edges"] else ""
-    return (
-        f"error {batch['error']:.6g} after {batch['iterations']} iterations{refused}; start: "
-        f"{', '.join([first, *others])}"
-    )
+    return f"error {batch['error']:.6g} after {batch['iterations']} iterations{refused}"

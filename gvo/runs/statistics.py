@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from array import array
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
@@ -19,8 +19,6 @@ from gvo.types import FaultyFrame, FrameResult, Progress, SegmentJoin, Status
 _MAX_UNTRACKED_SHARE = 0.1
 # The moving head or arm of a robot displaces its camera by less.
 _MAX_MOUNT_TRAVEL_M = 2.0
-# Of durations, relative.
-_RESOLUTION = 0.01
 
 
 @dataclass(slots=True, kw_only=True)
@@ -34,24 +32,6 @@ class Segment:
     n_tracked: int = 0
     joined_to: int | None = None
     joined_at_ns: int | None = None
-
-
-class Durations:
-    """Milliseconds counted by size, so that a long run takes no more memory than a short one."""
-
-    def __init__(self) -> None:
-        self._counts: Counter[int] = Counter()
-
-    def add(self, elapsed_ms: float) -> None:
-        """Count a duration; less than a microsecond counts as one."""
-        self._counts[round(math.log(max(elapsed_ms, 1e-3)) / _RESOLUTION)] += 1
-
-    def median_ms(self) -> float:
-        """Return the median within half a per cent."""
-        sizes = sorted(self._counts)
-        n_up_to = np.cumsum([self._counts[size] for size in sizes])
-        middle = int(np.searchsorted(n_up_to, 0.5 * n_up_to[-1]))
-        return math.exp(_RESOLUTION * sizes[middle])
 
 
 @dataclass(slots=True, kw_only=True)
@@ -69,7 +49,7 @@ class RunStatistics:
     window: WindowCounts = field(default_factory=WindowCounts)
     batch_result: BatchResult | None = None
     rig_offsets: RigOffsets | None = None
-    stages: dict[str, Durations] = field(default_factory=dict)
+    stages: dict[str, array[float]] = field(default_factory=dict)
     segments: dict[int, Segment] = field(default_factory=dict)
 
     @property
@@ -116,7 +96,7 @@ class RunStatistics:
             "batch": None if self.batch_result is None else self.batch_result.as_json(),
             "rig_offsets": None if self.rig_offsets is None else self.rig_offsets.as_json(),
             "median_ms": {
-                stage: round(durations.median_ms(), 3) for stage, durations in self.stages.items()
+                stage: round(float(np.median(values)), 3) for stage, values in self.stages.items()
             },
         }
 
@@ -170,7 +150,7 @@ class RunStatistics:
 
     def add_duration(self, stage: str, elapsed_ms: float) -> None:
         """Count the time of one frame in a stage, milliseconds."""
-        self.stages.setdefault(stage, Durations()).add(elapsed_ms)
+        self.stages.setdefault(stage, array("f")).append(elapsed_ms)
 
     def add_faulty(self, frame: FaultyFrame, *, is_loss: bool) -> None:
         """Count a lost frame, or an image without partner."""

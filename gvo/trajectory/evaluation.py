@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -36,11 +36,6 @@ _MIN_POSES = 3  # a rigid transform maps any two positions onto any other two
 SMOOTHED_GLOBAL = "smoothed = global"
 """How both are named where they are the same."""
 
-_HEADER = (
-    *("estimate", "poses", "of reference [%]", "ATE RMSE [m]", "ATE mean [m]", "ATE median [m]"),
-    *("ATE std [m]", "ATE max [m]", "RPE RMSE [m]", "RPE RMSE [deg]", "segments [m]", "t_err [%]"),
-    *("r_err [deg/100 m]", "path ratio"),
-)
 _JSON_NAMES = (
     *("name", "n", "reference_share", "ate_m", "ate_mean_m", "ate_median_m", "ate_std_m"),
     *("ate_max_m", "rpe_m", "rpe_deg", "n_segments", "segments_m", "t_pct", "r_deg_per_100m"),
@@ -392,27 +387,17 @@ def motions_of_chain(chain: Trajectory) -> list[Motions]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Consistency:
-    """Errors of motions with their stated covariances.
+class Consistency(Motions):
+    """Motions with their errors, and covariances as stated.
 
     Parameters
     ----------
-    name : str
-        That of the motions.
-    start_ns, end_ns : ndarray of int64, shape (n,)
-        Stamps of the two poses, nanoseconds.
     errors : ndarray of float64, shape (n, 6)
         (rx, ry, rz, tx, ty, tz), radians and metres: right perturbations of the motions that give
         the true ones.
-    covariances : ndarray of float64, shape (n, 6, 6)
-        As stated.
     """
 
-    name: str
-    start_ns: IntArray
-    end_ns: IntArray
     errors: FloatArray
-    covariances: FloatArray
 
     @property
     def sigmas(self) -> FloatArray:
@@ -476,6 +461,7 @@ def consistency(truth: Trajectory, motions: Motions) -> Consistency | None:
         name=motions.name,
         start_ns=start_ns,
         end_ns=end_ns,
+        T_start_end=T_start_end,
         errors=se3.log(se3.invert(T_start_end) @ se3.invert(T_a) @ T_b),
         covariances=motions.covariances[are_known],
     )
@@ -555,7 +541,7 @@ def evaluation_table(
             rows[-1] = replace(each, name=SMOOTHED_GLOBAL)
         else:
             rows.append(each)
-    return _HEADER, [_cells(evaluation) for evaluation in rows]
+    return tuple(_COLUMNS), [tuple(text(each) for text in _COLUMNS.values()) for each in rows]
 
 
 def _figures(evaluation: Evaluation) -> list[object]:
@@ -568,27 +554,27 @@ def evaluations_json(evaluations: Sequence[Evaluation]) -> dict[str, list[dict[s
     return {"estimates": rows}
 
 
-def _cells(evaluation: Evaluation) -> tuple[str, ...]:
-    position_errors = (
-        *(evaluation.ate_m, evaluation.ate_mean_m, evaluation.ate_median_m),
-        *(evaluation.ate_std_m, evaluation.ate_max_m),
-    )
-    return (
-        evaluation.name,
-        str(evaluation.n),
-        f"{100.0 * evaluation.reference_share:.1f}",
-        *(f"{value:.4f}" for value in position_errors),
-        number_text(evaluation.rpe_m, ".4f"),
-        number_text(evaluation.rpe_deg, ".4f"),
-        _segments(evaluation),
-        number_text(evaluation.t_pct, ".3f"),
-        number_text(evaluation.r_deg_per_100m, ".3f"),
-        number_text(evaluation.path_ratio, ".3f"),
-    )
-
-
 def _segments(evaluation: Evaluation) -> str:
     if evaluation.n_segments == 0:
         return "-"
     shortest, longest = min(evaluation.segments_m), max(evaluation.segments_m)
     return f"{shortest:g}" if shortest == longest else f"{shortest:g}..{longest:g}"
+
+
+_COLUMNS: dict[str, Callable[[Evaluation], str]] = {
+    "estimate": lambda e: e.name,
+    "poses": lambda e: str(e.n),
+    "of reference [%]": lambda e: f"{100.0 * e.reference_share:.1f}",
+    "ATE RMSE [m]": lambda e: f"{e.ate_m:.4f}",
+    "ATE mean [m]": lambda e: f"{e.ate_mean_m:.4f}",
+    "ATE median [m]": lambda e: f"{e.ate_median_m:.4f}",
+    "ATE std [m]": lambda e: f"{e.ate_std_m:.4f}",
+    "ATE max [m]": lambda e: f"{e.ate_max_m:.4f}",
+    "RPE RMSE [m]": lambda e: number_text(e.rpe_m, ".4f"),
+    "RPE RMSE [deg]": lambda e: number_text(e.rpe_deg, ".4f"),
+    "segments [m]": _segments,
+    "t_err [%]": lambda e: number_text(e.t_pct, ".3f"),
+    "r_err [deg/100 m]": lambda e: number_text(e.r_deg_per_100m, ".3f"),
+    "path ratio": lambda e: number_text(e.path_ratio, ".3f"),
+}
+"""The table of evaluations: text by header."""

@@ -45,7 +45,6 @@ _STYLE: dict[str, Any] = {
     "axes.titlesize": 9.0,
     "axes.grid": True,
     "axes.axisbelow": True,
-    "axes.formatter.useoffset": False,
     "figure.constrained_layout.h_pad": 0.06,
     "figure.constrained_layout.w_pad": 0.06,
     "grid.alpha": 0.3,

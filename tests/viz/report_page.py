@@ -28,7 +28,7 @@ class Page(HTMLParser):
         self.links += [values[n] for n in ("href", "src", "xlink:href") if n in values]
         if tag == "section":
             self._section = values.get("id", "")
-        if tag == "div" and values.get("role") == "img":
+        if tag in ("div", "canvas") and values.get("role") == "img":
             self.drawn.append(self._section)
         self._is_figure |= tag == "svg"
         if tag == "tr":

@@ -1,9 +1,9 @@
-"""Trajectories from above, from the side and in space."""
+"""Trajectories from above and from the side, and the scene that turns."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -19,9 +19,6 @@ _HEIGHT = 4.8
 # More would not be seen in a picture, and burden the page.
 _MAX_PATH_POINTS = 5000
 _MIN_EXTENT_M = 1e-3
-_MAX_SHOWN_M = 1e4
-_SPACE_LABEL_PAD = 9.0  # points; leaves room for numbers of four characters
-_SPACE_ZOOM = 0.78  # a long box, seen from a corner, must stay within its axes
 _DASHES = {"-": [], "--": [7, 5], "-.": [7, 4, 2, 4], ":": [2, 4]}
 
 
@@ -98,7 +95,6 @@ def loop_lines(ends: Mapping[str, FloatArray]) -> list[Line]:
 
 def path_plots(lines: Sequence[Line], world: World) -> list[Plot]:
     """Return the views from above, from the side and in space."""
-    near, labels = _near_origin(lines)
     points = np.concatenate([line.points for line in lines])
     extents = np.nanmax(points, axis=0) - np.nanmin(points, axis=0)
     along = max(world.ground, key=lambda axis: extents[axis])
@@ -111,44 +107,24 @@ def path_plots(lines: Sequence[Line], world: World) -> list[Plot]:
                 "has_truth": any(line.name == "truth" for line in lines),
                 "has_loops": any(line.style in LOOP_STYLES.values() for line in lines),
             },
-            figure=_view(near, labels, world.ground, is_flipped=False),
+            figure=_view(lines, world.ground, is_flipped=False),
             is_half=True,
         ),
         Plot(
             slug="side",
             title=TITLES["side"],
-            figure=_view(near, labels, (along, world.up), is_flipped=world.is_up_negative),
+            figure=_view(lines, (along, world.up), is_flipped=world.is_up_negative),
             is_half=True,
         ),
-        Plot(
-            slug="space",
-            title=TITLES["space"],
-            figure=_space(near, labels, world),
-        ),
+        Plot(slug="space", title=TITLES["space"]),  # a canvas of the page
     ]
 
 
-def _near_origin(lines: Sequence[Line]) -> tuple[list[Line], list[str]]:
-    """Shift coordinates of a map grid, for which axes have no room; also label the axes."""
-    low = np.nanmin(np.concatenate([line.points for line in lines]), axis=0)
-    origin = np.where(np.abs(low) >= _MAX_SHOWN_M, np.round(low, -3), 0.0)
-    labels = [_label(axis, shift) for axis, shift in zip("xyz", origin, strict=True)]
-    return [replace(line, points=line.points - origin) for line in lines], labels
-
-
-def _label(axis: str, origin: float) -> str:
-    if origin == 0.0:
-        return f"{axis} [m]"
-    return f"{axis} {'-' if origin > 0 else '+'} {abs(origin):.0f} [m]"
-
-
-def _view(
-    lines: Sequence[Line], labels: Sequence[str], plane: tuple[int, int], *, is_flipped: bool
-) -> Figure:
+def _view(lines: Sequence[Line], plane: tuple[int, int], *, is_flipped: bool) -> Figure:
     figure = new_figure(_HEIGHT, HALF)
     axes = figure.subplots()
     draw_lines(axes, lines, plane)
-    axes.set(xlabel=labels[plane[0]], ylabel=labels[plane[1]])
+    axes.set(xlabel=f"{'xyz'[plane[0]]} [m]", ylabel=f"{'xyz'[plane[1]]} [m]")
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.04)
     legend_above(figure, axes)
@@ -162,34 +138,6 @@ def draw_lines(axes: Any, lines: Sequence[Line], order: tuple[int, ...]) -> None
     for line in lines:
         axes.plot(*line.points[:, order].T, label=plain(line.name), **asdict(line.style))
     axes.plot(*lines[0].points[:1, order].T, "o", label="start", **HOLLOW)
-
-
-def _space(lines: Sequence[Line], labels: Sequence[str], world: World) -> Figure:
-    figure = new_figure(HALF, 1.2 * HALF)
-    axes: Any = figure.add_subplot(projection="3d")
-    order = (*world.ground, world.up)
-    draw_lines(axes, lines, order)
-    _set_box(axes, np.concatenate([line.points for line in lines])[:, order])
-    right, ahead, up = (labels[axis] for axis in order)
-    axes.set(xlabel=right, ylabel=ahead, zlabel=up)
-    axes.locator_params(nbins=5)
-    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
-        axis.labelpad = _SPACE_LABEL_PAD
-    if world.is_up_negative:
-        axes.invert_zaxis()
-    axes.view_init(elev=28, azim=-62)
-    legend_above(figure, axes)
-    return figure
-
-
-def _set_box(axes: Any, points: FloatArray) -> None:  # noqa: ANN401
-    """Set limits of one scale on three axes."""
-    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-    # thin boxes keep some room, or their labels overlap
-    half = 0.54 * np.maximum(high - low, max(0.4 * float(np.max(high - low)), _MIN_EXTENT_M))
-    limits = np.stack([0.5 * (low + high) - half, 0.5 * (low + high) + half], axis=1)
-    axes.set(xlim=limits[0], ylim=limits[1], zlim=limits[2])
-    axes.set_box_aspect(half, zoom=_SPACE_ZOOM)
 
 
 def turning_scene(lines: Sequence[Line], world: World) -> dict[str, Any]:

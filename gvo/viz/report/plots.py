@@ -53,9 +53,6 @@ _PANELS = (
 _UNKNOWN = "#999999"
 _FLOOR = 1e-3  # of the logarithmic axis
 _MARKERS = {"step": "o", "keyframe": "s", "depth": "^"}
-_HATCHES = {"step": "", "keyframe": "////", "depth": "\\\\\\\\"}
-_DECADES = (-3.0, 3.0)  # the histogram of chi-square spans 10^-3 to 10^3
-_N_BINS = 60
 
 
 TITLES = {
@@ -70,7 +67,6 @@ TITLES = {
     "counts": "Features, matches and inliers",
     "timings": "Milliseconds per frame",
     "chi2": "Chi-square of the edges",
-    "chi2_histogram": "Distribution of chi-square",
 }
 """Of the plots of a run, by slug, in their order."""
 
@@ -348,10 +344,10 @@ def _stack(axes: Axes, timings: Table, table: FloatArray) -> None:
     axes.stackplot(x, table, labels=labels, colors=colours, **looks)
 
 
-def edge_plots(edges: Table, first_ns: int) -> list[Plot]:
-    """Return the chi-square of the edges over time, and its histogram."""
+def edge_plot(edges: Table, first_ns: int) -> Plot:
+    """Return the chi-square of the edges over time."""
     if not edges or not np.any(np.isfinite(edges["chi2"])):
-        return not_drawn(("chi2", "chi2_histogram"), "the run has no edges with residuals")
+        return _not_drawn("chi2", "the run has no edges with residuals")
     bound = chi2_bound(0.95)
     n_refused = int(np.count_nonzero(~edges["is_accepted"]))
     numbers = {"floor": _FLOOR, "n_refused": n_refused, "n_edges": len(edges["chi2"])}
@@ -360,10 +356,7 @@ def edge_plots(edges: Table, first_ns: int) -> list[Plot]:
         values = edges["chi2"][_is_free(edges) & (edges["kind"] == kind)]
         if len(values) > 0:
             parts.append((kind, values.mean(), 100.0 * np.mean(values > bound)))
-    return [
-        _plot("chi2", _dots(edges, first_ns, bound), bound=bound, **numbers),
-        _plot("chi2_histogram", _histogram(edges, bound), bound=bound, parts=parts),
-    ]
+    return _plot("chi2", _dots(edges, first_ns, bound), bound=bound, parts=parts, **numbers)
 
 
 def _is_free(edges: Table) -> Any:  # noqa: ANN401
@@ -397,35 +390,3 @@ def _scatter(axes: Any, x: FloatArray, y: FloatArray, label: str, **looks: Any) 
     if len(x) > 0:
         looks |= {"markeredgewidth": 0.8, "rasterized": len(x) > MANY}
         axes.plot(x, y, linestyle="", label=label, **looks)
-
-
-def _histogram(edges: Table, bound: float) -> Figure:
-    figure = new_figure(3.0)
-    axes: Any = figure.subplots()
-    is_free = _is_free(edges)
-    for kind in palette.LINKS:
-        values = edges["chi2"][is_free & (edges["kind"] == kind)]
-        if len(values) > 0:
-            looks: dict[str, Any] = {"facecolor": palette.LINKS[kind], "hatch": _HATCHES[kind]}
-            axes.hist(
-                np.clip(np.log10(np.maximum(values, 1e-300)), *_DECADES),
-                np.linspace(*_DECADES, _N_BINS + 1),
-                density=True,
-                histtype="stepfilled",
-                edgecolor="black",
-                alpha=0.5,
-                label=f"{kind} ({len(values)})",
-                **looks,
-            )
-    grid = np.linspace(*_DECADES, 400)
-    values = 10.0**grid
-    # that of 6 degrees of freedom, over the decimal logarithm
-    density = values**2 * np.exp(-0.5 * values) / 16.0 * values * np.log(10.0)
-    axes.plot(grid, density, color="black", ls="--", label="chi-square of 6 dof")
-    axes.axvline(np.log10(bound), color="black", ls=":", label=f"95 % bound: {bound:.1f}")
-    decades = range(int(_DECADES[0]), int(_DECADES[1]) + 1)
-    axes.set_xticks(list(decades), [f"{10.0**decade:g}" for decade in decades])
-    axes.set(xlabel="chi-square [-]", ylabel="density per decade [-]")
-    axes.set(xlim=_DECADES, ylim=(0.0, None))
-    legend_above(figure, axes)
-    return figure

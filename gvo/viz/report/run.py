@@ -39,7 +39,7 @@ from gvo.viz.report.plots import (
     count_plot,
     covariance_plot,
     drift_plot,
-    edge_plots,
+    edge_plot,
     error_plots,
     not_drawn,
     pose_plots,
@@ -147,7 +147,7 @@ def write_run_report(
             status_plot(record.frames),
             count_plot(record.frames),
             timing_plot(record.timings),
-            *edge_plots(record.edges, _first_ns(record)),
+            edge_plot(record.edges, _first_ns(record)),
         ]
         # The page first: it must exist even if the folder cannot be written.
         scene = None if world is None else turning_scene(lines, world)

@@ -24,7 +24,6 @@ def serve(
     host: str = "127.0.0.1",
     port: int = 8080,
     truth: Trajectory | None = None,
-    name: str = "",
 ) -> Page:
     """Serve the page of a recording that is tracked, or of a run that goes on elsewhere.
 
@@ -38,8 +37,6 @@ def serve(
         Where it is taken, the next free one is used (see `Page.note`); 0: any.
     truth : Trajectory, optional
         Of the camera, in any world; drawn beside the estimates.
-    name : str
-        Title of the panel.
 
     Raises
     ------
@@ -52,4 +49,4 @@ def serve(
         raise missing_extra("the page in the browser needs viser", "view") from error
     from gvo.viz.view.page import Page
 
-    return Page(player, host=host, port=port, truth=truth, name=name)
+    return Page(player, host=host, port=port, truth=truth)

@@ -51,12 +51,10 @@ def _as_colours(greys: ImageArray) -> NDArray[np.uint8]:
 
 
 def accumulate(clouds: Sequence[tuple[FloatArray, Cloud]]) -> Cloud:
-    """Place clouds by their T_world_frame (4, 4); of more than 200,000 points keep each n-th."""
+    """Place clouds in the world by their T_world_frame (4, 4)."""
     placed = [se3.transform_points(T, points.astype(np.float64)) for T, (points, _) in clouds]
     points = np.concatenate([NO_CLOUD[0], *placed]).astype(np.float32)
-    colours = np.concatenate([NO_CLOUD[1], *(colours for _, (_, colours) in clouds)])
-    stride = max(math.ceil(len(points) / MAX_POINTS), 1)
-    return points[::stride], colours[::stride]
+    return points, np.concatenate([NO_CLOUD[1], *(colours for _, (_, colours) in clouds)])
 
 
 def halve(cloud: Cloud) -> Cloud:

@@ -60,13 +60,12 @@ class Page(AbstractContextManager["Page"]):
         host: str = "127.0.0.1",
         port: int = 0,
         truth: Trajectory | None = None,
-        name: str = "",
     ) -> None:
         self._player = player
         self._truth = truth if truth is not None and len(truth) > 0 else None
         self._absent = {"truth"} if truth is None else set()
         self._refusal = ""
-        title = f"gvo {name or player.source.info.name}".strip()
+        title = f"gvo {player.source.info.name}"
         self.server = server = open_server(host, port, title=title)
         free = server.get_port()
         self.note = ""

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.browser
 
-SECTIONS = 12
+SECTIONS = 11
 """Sections with a plot, at least: the paths, errors, drift, covariance, counts, times, edges."""
 
 _SHOWN = """
@@ -108,7 +108,6 @@ def test_print_shows_all_that_the_page_shows(browser: Browser, report: Path) -> 
     browser.open_file(report)
     on_screen = _shown(browser)
     with browser.in_print():
-        browser.wait(lambda: not browser.all("canvas")[0].is_displayed())
         assert _shown(browser) == on_screen
         for svg in _drawings(browser):
             assert overlapping_texts(browser, svg) == [], svg.get_attribute("aria-label")
