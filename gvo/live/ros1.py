@@ -264,19 +264,20 @@ _KINDS: Final[dict[str, tuple[Any, Any, Any]]] = {
     "integer": (int, -(2**31), 2**31 - 1),
     "number": (float, -math.inf, math.inf),
 }
-_NULL = "__null"
+_NULL = "null"
 
 
 class _Reconfigure:
     """A server of dynamic_reconfigure.
 
-    A parameter is named `section__key`, in the group of its section. One that may be null has a
-    switch `section__key__null` beside it; giving a number turns the switch off.
+    A parameter is named `section__key`, in the group of its section. One that may be null is a
+    text.
     """
 
     def __init__(self, node: Ros1, parameters: Parameters, *, warn: Callable[[str], None]) -> None:
         self._parameters, self._warn = parameters, warn
-        self._known = _known_parameters()
+        every = chain(*list_parameters().values())
+        self._known = {f"{one.section}__{one.key}": _shown(one) for one in every}
         self._tell_config = _opened(node, "~parameter_updates", "Config")
         _opened(node, "~parameter_descriptions", "ConfigDescription")(self._description())
         self._tell(parameters.config)
@@ -301,25 +302,14 @@ class _Reconfigure:
     def _wanted(self, config: Any) -> dict[str, Any]:  # noqa: ANN401 - made at run time
         """Return the values that a request sets, by `section.key`."""
         lists = [getattr(config, f"{type_}s") for type_ in _TYPES.values()]
-        given = {item.name: item.value for item in chain(*lists)}
-        shown = self._values(self._parameters.config)
-        wanted = {}
-        for name, value in given.items():
-            number = name.removesuffix(_NULL)
-            if number == name:
-                is_null = given.get(f"{name}{_NULL}", False)
-            else:
-                is_null, value = value, given.get(number, shown.get(number))
-            wanted[number.replace("__", ".")] = None if is_null else value
-        return wanted
+        given = {item.name.replace("__", "."): item.value for item in chain(*lists)}
+        return {name: None if value == _NULL else value for name, value in given.items()}
 
     def _values(self, config: Config) -> dict[str, Any]:
         values = {}
         for name, one in self._known.items():
             value = getattr(getattr(config, one.section), one.key)
-            if name.endswith(_NULL):
-                value = value is None
-            values[name] = _KINDS[one.kind][0](one.start if value is None else value)
+            values[name] = _NULL if value is None else _KINDS[one.kind][0](value)
         return values
 
     def _description(self) -> Any:  # noqa: ANN401 - made at run time
@@ -349,17 +339,9 @@ class _Reconfigure:
         return _make("ConfigDescription", groups=groups, dflt=defaults, **bounds)
 
 
-def _known_parameters() -> dict[str, Parameter]:
-    known = {}
-    for one in chain(*list_parameters().values()):
-        name = f"{one.section}__{one.key}"
-        known[name] = one
-        if one.is_optional:
-            hint = f"{one.key} is null; a value that is given turns this off"
-            known[f"{name}{_NULL}"] = replace(
-                one, kind="switch", choices=(), minimum=None, maximum=None, hint=hint
-            )
-    return known
+def _shown(one: Parameter) -> Parameter:
+    """Return what may be null as a text."""
+    return replace(one, kind="choice", minimum=None, maximum=None) if one.is_optional else one
 
 
 def _enumeration(parameter: Parameter) -> str:

@@ -153,8 +153,8 @@ def reconfigure() -> dict[str, Any]:
         for name, value, asked in (
             ("klt__n_corners", 120, "klt__n_corners"),
             ("klt__n_corners", -1, "klt__n_corners"),
-            ("camera__readout_ms", 3.5, "camera__readout_ms__null"),
-            ("camera__readout_ms__null", True, "camera__readout_ms__null"),
+            ("camera__readout_ms", "3.5", "camera__readout_ms"),
+            ("camera__readout_ms", "null", "camera__readout_ms"),
             ("features__kind", "sift", "features__kind"),
             ("features__kind", "orb", "features__kind"),
         )
@@ -162,7 +162,7 @@ def reconfigure() -> dict[str, Any]:
     return {
         "n": len(first) - 1,  # but the groups
         "groups": [*client.get_group_descriptions()["groups"]],
-        "size": listed["window__size"],
+        "corners": listed["klt__n_corners"],
         "readout": listed["camera__readout_ms"],
         "kind": listed["features__kind"]["edit_method"],
         "answers": answers,

@@ -136,15 +136,15 @@ def test_a_session_goes_on_whatever_comes(ros: Ros, gvo_data: Path, tmp_path: Pa
 def check_parameters(told: dict[str, Any]) -> None:
     """Check what the client of dynamic_reconfigure was told."""
     listed = [one for each in list_parameters().values() for one in each]
-    assert told["n"] == len(listed) + sum(one.is_optional for one in listed)
+    assert told["n"] == len(listed)
     assert told["groups"] == [*list_parameters()]
-    size, readout = told["size"], told["readout"]
-    assert (size["type"], size["min"], size["max"], size["default"]) == ("int", 2, 1000, 5)
-    assert "default 5" in size["description"]
-    assert (readout["type"], readout["min"], readout["max"]) == ("double", -100.0, 100.0)
+    corners, readout = told["corners"], told["readout"]
+    assert (corners["type"], corners["min"], corners["max"]) == ("int", 50, 20000)
+    assert "default 250" in corners["description"]
+    assert (readout["type"], readout["default"]) == ("str", "null")
     choices = [choice["value"] for choice in ast.literal_eval(told["kind"])["enum"]]
     assert choices == ["orb", "sift", "fast", "gftt"]
-    assert told["answers"] == [120, 120, False, True, "sift", "orb"]
+    assert told["answers"] == [120, 120, "3.5", "null", "sift", "orb"]
 
 
 @pytest.mark.acceptance

@@ -10,11 +10,10 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from gvo.errors import RecordingError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
 from gvo.io.convert.plan import Form, Plan, pose_of_right, pose_on_body
-from gvo.io.datasets.tum import DEFAULT_SCALE, published_calibration
+from gvo.io.datasets.tum import DEFAULT_SCALE
 from gvo.io.frames import paired
 from gvo.io.images import MAX_COUNT, MILLIMETRES, encode_image, is_in_counts, to_counts
 from gvo.io.recording import StampedImage
@@ -137,7 +136,7 @@ class TumForm(Form):
     def __init__(self, path: Path, plan: Plan) -> None:
         super().__init__(path, plan)
         self._tables: tuple[list[str], list[str]] = ([], [])
-        self._scale = _scale_by_name(path.name, self.plan.calibrations[0])
+        self._scale: float | None = None
         self._n_cut = 0
         for name in ("rgb", "depth"):
             (path / name).mkdir(parents=True)
@@ -168,19 +167,6 @@ class TumForm(Form):
         if self.plan.truth is not None:
             write_tum(self.path / "groundtruth.txt", self.plan.truth)
             self.n_poses = len(self.plan.truth)
-
-
-def _scale_by_name(name: str, mine: Calibration) -> float | None:
-    """Return the scale that a folder's name stands for; None where it stands for none."""
-    published = published_calibration(name)
-    if published is None:
-        return None
-    if any(not np.array_equal(getattr(published, key), getattr(mine, key)) for key in "KDP"):
-        raise RecordingError(
-            f"{name}: a TUM folder of this name is read with the published calibration of "
-            "freiburg1, 2 or 3, which is not that of the recording; give another name"
-        )
-    return DEFAULT_SCALE
 
 
 def _choose_scale(depth: DepthArray) -> float | None:

@@ -44,8 +44,8 @@ _CAMERA_NAME = re.compile(r"(?<![a-z])(?:freiburg|fr)([123])(?![a-z0-9])")
 class TumSource(FolderSource):
     """A folder with `rgb.txt` and `depth.txt`.
 
-    The calibration is, first found: the file given, the published one of the camera that the
-    folder's name tells (freiburg1 or fr1, and so on), `calibration.yaml` in the folder.
+    The calibration is, first found: the file given, `calibration.yaml` in the folder, the published
+    one of the camera that the folder's name tells (freiburg1 or fr1, and so on).
 
     Parameters
     ----------
@@ -96,27 +96,19 @@ def _list_images(table: Path) -> list[StampedPath]:
 
 def _find_calibration(folder: Path, explicit: tuple[Path, ...], size: ImageSize) -> CameraSet:
     beside = folder / "calibration.yaml"
+    paths = explicit or ((beside,) if beside.is_file() else ())
+    if paths:
+        cameras = read_cameras(paths, sensor="rgbd", is_rectified=False, image_size=size)
+        return replace(cameras, origin=" + ".join(path.name for path in paths))
     named = _CAMERA_NAME.search(folder.resolve().name.lower())
-    if not explicit and named is not None:
-        origin = f"published for freiburg{named[1]}, by the name of the folder"
-        if beside.is_file():
-            origin += f"; {beside.name} there is not used, give it by --calibration to use it"
-        camera = _published_camera(*_CAMERAS[named[1]])
-        return CameraSet(calibrations=(camera,), origin=origin, depth_scale=DEFAULT_SCALE)
-    if not explicit and not beside.is_file():
+    if named is None:
         raise CalibrationError(
             f"{folder}: no calibration is known: the name holds none of freiburg1, freiburg2, "
             "freiburg3; add calibration.yaml or give --calibration FILE"
         )
-    paths = explicit or (beside,)
-    cameras = read_cameras(paths, sensor="rgbd", is_rectified=False, image_size=size)
-    return replace(cameras, origin=" + ".join(path.name for path in paths))
-
-
-def published_calibration(name: str) -> Calibration | None:
-    """Return the published calibration of the camera that a folder's name tells, if any."""
-    named = _CAMERA_NAME.search(name.lower())
-    return None if named is None else _published_camera(*_CAMERAS[named[1]])
+    camera = _published_camera(*_CAMERAS[named[1]])
+    origin = f"published for freiburg{named[1]}, by the name of the folder"
+    return CameraSet(calibrations=(camera,), origin=origin, depth_scale=DEFAULT_SCALE)
 
 
 def _published_camera(
