@@ -37,6 +37,7 @@ _TYPES: dict[str | None, Any] = {
     "f4": types.float32,
     "f8": types.float64,
     "i8": types.int64,
+    "i2": types.int16,
     "u1": types.uint8,
     "u2": types.uint16,
     "b1": types.boolean,

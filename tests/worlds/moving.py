@@ -98,7 +98,8 @@ class MirrorScene:
 
 def look_beyond(plane: Plane, scene: Scene, T_map_cam: FloatArray, camera: PinholeCamera) -> View:
     """Return the view of what lies on the side of a plane that its normal points to."""
-    view, T_cam_map = look(scene, T_map_cam, camera), invert(T_map_cam)
+    T_cam_map = invert(T_map_cam).reshape(-1, 4, 4)
+    view = look(scene, T_map_cam, camera)
     R = T_cam_map[..., :3, :3]
     point, normal = R @ plane[0] + T_cam_map[..., :3, 3], R @ plane[1]
     offset = np.asarray(np.einsum("...j,...j->...", normal, point))[..., np.newaxis, np.newaxis]

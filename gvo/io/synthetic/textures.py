@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
+from gvo.types import BoolArray, ImageArray, IntArray
 
 _MAX_ROWS = 32_000  # cv2.remap addresses images with 16 bits
 _SMALLEST_LEVEL = 4
@@ -75,44 +75,29 @@ class TextureAtlas:
             x, y = (k // per_column) * span, (k % per_column) * span
             corners.append((x, y))
             _write_levels(self._image[y : y + span, x : x + span], texture.pixels, starts)
-        self.corners: FloatArray = np.array(corners, dtype=np.float64)
+        self.corners: NDArray[np.float32] = np.array(corners, dtype=np.float32)
         # Texel t of level i is at starts[i] + 1 + (t / 2^i - 0.5): one texel of gutter.
-        self._scales = (0.5 ** np.arange(n_levels)).astype(np.float32)
-        self._starts = (starts[:-1] + 0.5).astype(np.float32)
-        self._masks = [_mask_levels(texture.mask, n_levels) for texture in textures]
+        self.starts = (starts[:-1] + 0.5).astype(np.float32)
+        masks = [_mask_levels(texture.mask, n_levels) for texture in textures]
+        self.masks: BoolArray = np.concatenate(masks)
+        lengths = np.array([len(each) for each in masks])
+        self._mask_starts = np.cumsum(lengths) - lengths
+        self._level_starts = np.cumsum(sizes**2) - sizes**2
+        self._mask_sizes = np.where(lengths[:, np.newaxis] > 0, sizes, 0)
 
-    def locate(
-        self, texels: NDArray[np.float32], footprints: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
-        """Return where in the atlas texture coordinates lie, relative to the texture's corner."""
-        exponents = (footprints * np.float32(np.sqrt(2.0))).view(np.int32) >> 23
-        levels = np.clip(exponents - 127, 0, len(self._scales) - 1)
-        wrapped = texels - np.floor(texels * np.float32(1.0 / self.size)) * np.float32(self.size)
-        return np.asarray(wrapped * self._scales.take(levels) + self._starts.take(levels))
+    def cuts(self, textures: IntArray, levels: IntArray) -> IntArray:
+        """Return where in `masks` those of textures begin, and their sizes (0: none), (n, 2)."""
+        levels = np.minimum(levels, len(self.starts) - 1)
+        starts = self._mask_starts[textures] + self._level_starts[levels]
+        return np.stack([starts, self._mask_sizes[textures, levels]], axis=1)
 
     def sample(self, map_x: NDArray[np.float32], map_y: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the grey values at positions in the atlas, bilinear."""
-        shape = map_x.shape
-        if map_x.ndim == 1:  # cv2.remap writes images of fewer than 2^15 rows
-            pad = -len(map_x) % 256
-            map_x = np.pad(map_x, (0, pad)).reshape(-1, 256)
-            map_y = np.pad(map_y, (0, pad)).reshape(-1, 256)
-        if map_x.size == 0:
-            return np.zeros(shape, dtype=np.float32)
-        grey = np.asarray(cv2.remap(self._image, map_x, map_y, cv2.INTER_LINEAR))
-        return grey.ravel()[: np.prod(shape)].reshape(shape).astype(np.float32)
-
-    def is_opaque(
-        self, texture: int, level: int, s: NDArray[np.float32], t: NDArray[np.float32]
-    ) -> BoolArray:
-        """Tell where a texture is opaque."""
-        masks = self._masks[texture]
-        mask = masks[min(level, len(masks) - 1)]
-        n = len(mask)
-        scale = np.float32(n / self.size)
-        columns = np.floor(s * scale).astype(np.int32) & (n - 1)
-        rows = np.floor(t * scale).astype(np.int32) & (n - 1)
-        return np.asarray(mask.ravel().take(rows * n + columns))
+        """Return the grey values at n positions in the atlas, bilinear."""
+        # cv2.remap writes images of fewer than 2^15 rows.
+        pad = (0, -len(map_x) % 256 or 256 * (len(map_x) == 0))
+        x, y = (np.pad(each, pad).reshape(-1, 256) for each in (map_x, map_y))
+        grey = np.asarray(cv2.remap(self._image, x, y, cv2.INTER_LINEAR))
+        return grey.ravel()[: len(map_x)].astype(np.float32)
 
 
 def _write_levels(block: ImageArray, pixels: ImageArray, starts: IntArray) -> None:
@@ -126,16 +111,16 @@ def _write_levels(block: ImageArray, pixels: ImageArray, starts: IntArray) -> No
         narrow = 0.5 * (narrow[:, 0::2] + narrow[:, 1::2])
 
 
-def _mask_levels(mask: BoolArray | None, n_levels: int) -> list[BoolArray]:
+def _mask_levels(mask: BoolArray | None, n_levels: int) -> BoolArray:
     if mask is None:
-        return []
+        return np.zeros(0, dtype=np.bool_)
     shares = mask.astype(np.float32)
-    levels = [mask]
+    levels = [mask.ravel()]
     for _ in range(n_levels - 1):
         shares = 0.5 * (shares[0::2] + shares[1::2])
         shares = 0.5 * (shares[:, 0::2] + shares[:, 1::2])
-        levels.append(shares >= 0.5)
-    return levels
+        levels.append(shares.ravel() >= 0.5)
+    return np.concatenate(levels)
 
 
 def blank(grey: float) -> Canvas:
