@@ -125,8 +125,6 @@ class History:
         Newest poses of the window by stamp, where they were given.
     loops : list of Loop
         Those that were confirmed.
-    recent : dict of str to list of ndarray
-        Raw and causal positions (3,) since the last full second of the recording, metres.
     is_second_new : bool
         Whether a second of the recording began with the newest frame.
     """
@@ -136,7 +134,6 @@ class History:
         self.keyframes: dict[int, Estimate] = {}
         self.window: dict[int, Estimate] = {}
         self.loops: list[Loop] = []
-        self.recent: dict[str, list[FloatArray]] = {"raw": [], "causal": []}
         self.is_second_new = False
         self._first_ns: int | None = None
         self._n_seconds = 0
@@ -150,9 +147,6 @@ class History:
         self._n_seconds = max(n_seconds, self._n_seconds)
         for name, estimate in (("raw", result.raw), ("causal", result.causal)):
             self.tracks[name].add(estimate)
-            if self.is_second_new:
-                self.recent[name].clear()
-            self.recent[name].append(estimate.T_world_frame[:3, 3])
         known = {**self.keyframes, result.stamp_ns: result.causal}
         self.keyframes = {ns: known[ns] for ns in result.keyframes_ns if ns in known}
         self.loops += result.loops
@@ -221,8 +215,6 @@ class Scene:
         As `History` has them.
     paths : dict of str to Path
         Where a full second of the recording begins, each of at most 500 poses; else none.
-    recent : dict of str to ndarray of float64, shape (n, 3)
-        Raw and causal positions since then, metres.
     lines : dict of str to ndarray of float64, shape (n, 2, 3)
         Links of the frame by kind ("step", "keyframe link", "depth") or "refused",
         and its "loops", metres.
@@ -238,7 +230,6 @@ class Scene:
     keyframes: tuple[Estimate, ...]
     window: tuple[Estimate, ...]
     paths: dict[str, Path]
-    recent: dict[str, FloatArray]
     lines: dict[str, FloatArray]
     points: Points
     counts: dict[str, int]
@@ -264,7 +255,6 @@ def scene(result: FrameResult, history: History) -> Scene:
         keyframes=tuple(history.keyframes.values()),
         window=tuple(history.window.values()),
         paths=history.paths(N_SHOWN_POSES) if history.is_second_new else {},
-        recent={name: np.array(found) for name, found in history.recent.items()},
         lines=_links(result, history) | ({"loops": loops} if len(loops) else {}),
         points=matched_points(result),
         counts={

@@ -45,7 +45,7 @@ def there_and_back() -> Held:
     start_ns = source.items[0].stamp_ns
     way = [*range(N_FRAMES), *range(N_FRAMES - 2, 0, -1)]
     items = [
-        replace(image, stamp_ns=start_ns + number * 50_000_000, log_time_ns=None)
+        replace(image, stamp_ns=start_ns + number * 50_000_000)
         for number in range(N_LONG)
         for image in source.items[2 * way[number % len(way)] :][:2]
     ]

@@ -47,7 +47,6 @@ class Rule:
 
 
 MAX_BLUR_PX = 1.6
-MAX_CLOCK_JUMP_MS = 100.0
 MIN_STEREO_MATCHES = 60
 MAX_DEPTH_MEDIAN_M = 50.0
 # Streams of one trigger differ by less than 2 ms. A depth camera that runs freely is half a period
@@ -80,14 +79,6 @@ RULES: Mapping[str, Rule] = {
     # `STAMP_DIFFERENCES_MS` has the limit of each sensor.
     "stamp difference": Rule(
         unit="ms", fix="trigger both by hardware, or take a shared offset off the stamps"
-    ),
-    # Messages are late at random by some ten milliseconds; clocks that are set jump by more.
-    "clock jump": Rule(
-        high=MAX_CLOCK_JUMP_MS, unit="ms", fix="a clock was set, or recording stalled"
-    ),
-    # 60 ms a minute is a thousandth; clocks of quartz are a hundred times better.
-    "clock drift": Rule(
-        low=-60.0, high=60.0, unit="ms/min", fix="synchronise the camera's clock (PTP, NTP)"
     ),
     # A baseline outside is mostly one in a wrong unit.
     "baseline": Rule(

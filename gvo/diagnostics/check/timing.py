@@ -1,4 +1,4 @@
-"""Stamps: rates, gaps, partners, and the clocks of camera and recording."""
+"""Stamps: rates, gaps, partners."""
 
 from __future__ import annotations
 
@@ -10,13 +10,7 @@ import numpy as np
 from gvo.backend.motion_model import LOST_AFTER_S
 from gvo.config import Config
 from gvo.diagnostics.check.findings import Finding
-from gvo.diagnostics.check.limits import (
-    MAX_CLOCK_JUMP_MS,
-    STAMP_DIFFERENCES_MS,
-    lost,
-    measured,
-    unknown,
-)
+from gvo.diagnostics.check.limits import STAMP_DIFFERENCES_MS, lost, measured, unknown
 from gvo.diagnostics.check.sampling import Survey
 from gvo.io.frames import pair_limit_key
 from gvo.io.recording import RecordingInfo
@@ -24,12 +18,6 @@ from gvo.types import FloatArray, IntArray
 
 # Length of a gap, periods; shorter intervals are jitter.
 _GAP_PERIODS = 2.5
-# The clocks are compared by medians over stretches of the recording.
-_N_STRETCHES = 40
-_MIN_PER_STRETCH = 3
-_MIN_STRETCHES = 4
-# A drift is real beyond so many standard deviations.
-_DRIFT_SIGMAS = 4.0
 # Near half a period, images are paired with the partners of others; streams that have nothing to
 # do with each other have differences of any size up to there.
 _MAX_SHARE_OF_PERIOD = 0.4
@@ -42,10 +30,6 @@ def check_timing(survey: Survey, info: RecordingInfo, config: Config) -> Iterato
         yield from _check_stream(name, stamps_ns, config)
     if all(len(stamps_ns) for stamps_ns in survey.stamps_ns):
         yield from _check_pairs(survey, info, config)
-    streams = zip(info.stream_names, survey.stamps_ns, survey.log_times_ns, strict=True)
-    for name, stamps_ns, log_times_ns in streams:
-        if len(log_times_ns) == len(stamps_ns) > 0:
-            yield from _check_clock(name, stamps_ns, log_times_ns)
 
 
 def _check_stream(name: str, stamps_ns: IntArray, config: Config) -> Iterator[Finding]:
@@ -132,40 +116,3 @@ def _nearest_differences(first_ns: IntArray, second_ns: IntArray) -> FloatArray:
     to_after, to_before = ordered[after] - first_ns, ordered[before] - first_ns
     is_before = np.abs(to_before) < np.abs(to_after)
     return np.asarray(np.where(is_before, to_before, to_after), dtype=np.float64)
-
-
-def _check_clock(name: str, stamps_ns: IntArray, log_times_ns: IntArray) -> Iterator[Finding]:
-    """Compare the header stamps with the times of recording.
-
-    Messages are late at random, now and then very late. So medians over stretches of the recording
-    are compared: their slope is the drift of one clock against the other, their largest step a
-    jump. A constant difference is harmless.
-    """
-    offsets_ms = (log_times_ns - stamps_ns) / 1e6
-    value = f"{np.median(offsets_ms) / 1e3:.3g} s after the header"
-    yield Finding(name=f"{name}: recording clock", value=value)
-    n_stretches = min(_N_STRETCHES, len(offsets_ms) // _MIN_PER_STRETCH)
-    if n_stretches < _MIN_STRETCHES:
-        yield unknown(f"{name}: clock drift", f"{len(offsets_ms)} images are too few")
-        return
-    middles_s = _medians((stamps_ns - stamps_ns[0]) / 1e9, n_stretches)
-    levels_ms = _medians(offsets_ms, n_stretches)
-    steps_ms = np.diff(levels_ms)
-    jump_ms = float(np.abs(steps_ms - np.median(steps_ms)).max())
-    yield measured(f"{name}: clock jump", jump_ms)
-    drift = 0.0 if jump_ms > MAX_CLOCK_JUMP_MS else _drift(middles_s, levels_ms)
-    yield measured(f"{name}: clock drift", drift)
-
-
-def _medians(values: FloatArray, n_stretches: int) -> FloatArray:
-    return np.array([np.median(part) for part in np.array_split(values, n_stretches)])
-
-
-def _drift(middles_s: FloatArray, levels_ms: FloatArray) -> float:
-    """Return the slope in ms/min; zero if it is not significant."""
-    if np.ptp(middles_s) <= 0:
-        return 0.0
-    slope, level = np.polyfit(middles_s, levels_ms, 1)
-    scatter = np.std(levels_ms - (slope * middles_s + level))
-    sigma = scatter / (np.std(middles_s) * math.sqrt(len(middles_s)))
-    return 60.0 * float(slope) if abs(slope) > _DRIFT_SIGMAS * sigma else 0.0

@@ -5,7 +5,7 @@ Entities
 ===========================================  ======================================================
 `world`                                      x right, y down, z forward, or x forward, z up
 `world/NAME/frame`                           poses; NAME: raw, causal, smoothed, global
-`world/NAME/path`, `world/NAME/recent`       where it was up to the last full second, and since
+`world/NAME/path`                            where it was up to the last full second
 `world/NAME/covariance`                      3-sigma ellipsoid of the position; NAME: raw, causal
 `world/causal/frame/camera`                  how the camera sits in the frame
 `world/causal/frame/camera/image`            its pinhole model and the image
@@ -299,8 +299,6 @@ class RunRerun(FileOutput):
         if "loops" in seen.lines:
             self._log(_LOOPS, _lines({"loops": seen.lines["loops"]}, _LINE))
         self._add_paths(seen.paths)
-        for name, positions in seen.recent.items():
-            self._log(f"world/{name}/recent", _strip(name, positions))
 
     def _add_paths(self, paths: Mapping[str, PosePath]) -> None:
         for name, (_, poses) in paths.items():

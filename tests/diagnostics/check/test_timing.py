@@ -1,4 +1,4 @@
-"""Stamps: planted faults of rate, order, partners and clocks."""
+"""Stamps: planted faults of rate, order and partners."""
 
 from __future__ import annotations
 
@@ -28,13 +28,11 @@ IS_FIRST_HALF = np.arange(300) < 150
 
 OF_STAMPS = (
     *("stamps", "period", "jitter", "gaps", "dropped frames", "stamp difference"),
-    *("frames without partner", "clock jump", "clock drift"),
+    "frames without partner",
 )
 
 
-def timing(
-    colour: Stamps, depth: Stamps | None = None, *, logs_ns: Stamps | None = None
-) -> dict[str, Finding]:
+def timing(colour: Stamps, depth: Stamps | None = None) -> dict[str, Finding]:
     """Check small plain images of these stamps; return what is told of the stamps."""
     streams = (colour, colour if depth is None else depth)
     images = [
@@ -42,7 +40,6 @@ def timing(
             stream=stream,
             stamp_ns=int(streams[stream][number]),
             load=partial(IMAGES.__getitem__, stream),
-            log_time_ns=None if logs_ns is None or stream else int(logs_ns[number]),
         )
         for _, stream, number in sorted(
             (number / len(stamps_ns), stream, number)
@@ -139,23 +136,3 @@ def test_a_tolerance_that_is_too_small_is_named_with_one_that_is_not() -> None:
     assert "--set sync.stereo_tolerance_ms=5" in finding.fix
     # The images are looked at all the same.
     assert find(result, "left/right: row offset").verdict == "ok"
-
-
-LATE = np.random.default_rng(1).exponential(2 * MS, 300)
-ELAPSED = REGULAR - REGULAR[0]
-
-
-@pytest.mark.parametrize(
-    ("delays_ns", "told", "value"),
-    [
-        *((offset_ns + 4 * LATE, "", 0.0) for offset_ns in (0, 86_400_000 * MS, -5_000 * MS)),
-        (0.005 * ELAPSED + LATE, "colour: clock drift", 300.0),  # ms a minute
-        (np.where(np.arange(300) < 170, 2, 402) * MS, "colour: clock jump", 400.0),
-    ],
-    ids=["late", "a day apart", "ahead", "drift", "set"],
-)
-def test_clocks_that_drift_or_are_set_are_found(delays_ns: Stamps, told: str, value: float) -> None:
-    findings = timing(REGULAR, logs_ns=REGULAR + delays_ns)
-    assert complaints(findings) == ({told} if told else set())
-    if told:
-        assert findings[told].value == pytest.approx(value, rel=0.1)
