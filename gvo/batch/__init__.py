@@ -12,7 +12,7 @@ from gvo.errors import missing_extra
 
 try:
     from gvo.batch.engine import BatchProgress, ClusterError, connected
-    from gvo.batch.inputs import NamedRecording, Variant, find_recordings, make_variants
+    from gvo.batch.inputs import find_recordings, make_variants
     from gvo.batch.running import run, run_batch
     from gvo.batch.tasks import BatchOptions
 except ModuleNotFoundError as error:
@@ -25,8 +25,6 @@ __all__ = [
     "BatchOptions",
     "BatchProgress",
     "ClusterError",
-    "NamedRecording",
-    "Variant",
     "connected",
     "find_recordings",
     "make_variants",

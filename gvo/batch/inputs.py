@@ -8,7 +8,6 @@ import os
 import re
 from collections import Counter
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import TypeVar
@@ -34,23 +33,7 @@ _MAX_SHOWN = 100
 _MAX_VARIANTS = 100_000
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NamedRecording:
-    """A recording and its name in the batch.
-
-    Parameters
-    ----------
-    name : str
-        Unique, and valid as the name of a folder.
-    location : str
-        Absolute path.
-    """
-
-    name: str
-    location: str
-
-
-def find_recordings(asked: Sequence[str | Path]) -> list[NamedRecording]:
+def find_recordings(asked: Sequence[str | Path]) -> dict[str, str]:
     """Find recordings, each once, in the order asked for.
 
     Parameters
@@ -58,6 +41,11 @@ def find_recordings(asked: Sequence[str | Path]) -> list[NamedRecording]:
     asked : sequence of str or Path
         Each a path of a recording, or a folder, which is searched unless it is a recording itself.
         A path that does not exist is taken for a recording that only the workers see.
+
+    Returns
+    -------
+    dict of str to str
+        Absolute paths by names that are unique, and valid as names of folders.
 
     Raises
     ------
@@ -98,7 +86,7 @@ def _is_bag(name: str) -> bool:
     return name.removesuffix(_COMPRESSED).endswith(BAG_SUFFIXES)
 
 
-def _name(locations: Sequence[str]) -> list[NamedRecording]:
+def _name(locations: Sequence[str]) -> dict[str, str]:
     """Name each by its stem; where that repeats, by its path below the folder of all."""
     stems = Counter(map(_stem, locations))
     folder = os.path.commonpath([Path(each).parent for each in locations])
@@ -107,8 +95,7 @@ def _name(locations: Sequence[str]) -> list[NamedRecording]:
         is_unique = stems[_stem(each)] == 1
         below = "-".join(Path(each).relative_to(folder).parts)
         names.append((_stem(each) if is_unique else below, each))
-    named = _numbered(names, _TAKEN)
-    return [NamedRecording(name=name, location=each) for name, each in named.items()]
+    return _numbered(names, _TAKEN)
 
 
 def _stem(location: str) -> str:
@@ -128,25 +115,10 @@ def _numbered(named: Iterable[tuple[str, T]], taken: Container[str] = ()) -> dic
     return found
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Variant:
-    """A configuration and its name in the batch.
-
-    Parameters
-    ----------
-    name : str
-        Unique, and valid as the name of a folder.
-    config : Config
-    """
-
-    name: str
-    config: Config
-
-
 def make_variants(
     files: Sequence[Path] = (), settings: Sequence[str] = (), sweeps: Sequence[str] = ()
-) -> list[Variant]:
-    """Return each configuration file with each combination of swept values.
+) -> dict[str, Config]:
+    """Return each configuration file with each combination of swept values, by its name.
 
     Parameters
     ----------
@@ -180,7 +152,7 @@ def make_variants(
 
 def name_variants(
     configs: Config | Sequence[Config] | Mapping[str, Config] | None,
-) -> list[Variant]:
+) -> dict[str, Config]:
     """Name configurations by their keys, or by the values in which they differ.
 
     Raises
@@ -199,10 +171,9 @@ def name_variants(
     return _variants(zip(map(_text_of, differences(configs)), configs, strict=True))
 
 
-def _variants(named: Iterable[tuple[str, Config]]) -> list[Variant]:
+def _variants(named: Iterable[tuple[str, Config]]) -> dict[str, Config]:
     """Make the names unique, and valid as names of folders."""
-    numbered = _numbered((name or DEFAULT, config) for name, config in named)
-    return [Variant(name=name, config=config) for name, config in numbered.items()]
+    return _numbered((name or DEFAULT, config) for name, config in named)
 
 
 def differences(configs: Sequence[Config]) -> list[dict[str, Value]]:

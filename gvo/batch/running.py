@@ -14,7 +14,7 @@ from distributed import Client
 
 from gvo._version import __version__
 from gvo.batch.engine import BatchProgress, Engine, connected
-from gvo.batch.inputs import NamedRecording, Variant, differences, find_recordings, name_variants
+from gvo.batch.inputs import differences, find_recordings, name_variants
 from gvo.batch.results import CSV, to_frame, write_results
 from gvo.batch.tasks import MARK, BatchOptions, BatchRow, Task, TaskOptions
 from gvo.config import Config
@@ -84,8 +84,8 @@ def run(
 
 
 def run_batch(
-    recordings: Sequence[NamedRecording],
-    variants: Sequence[Variant],
+    recordings: Mapping[str, str],
+    variants: Mapping[str, Config],
     *,
     out: str | Path,
     client: Client | None = None,
@@ -131,20 +131,20 @@ def check_place(out: str | Path, tasks: Sequence[Task], options: BatchOptions) -
             )
 
 
-def make_tasks(recordings: Sequence[NamedRecording], variants: Sequence[Variant]) -> list[Task]:
+def make_tasks(recordings: Mapping[str, str], variants: Mapping[str, Config]) -> list[Task]:
     """Return a task for each recording with each configuration."""
-    parameters = differences([variant.config for variant in variants])
+    parameters = differences([*variants.values()])
     return [
         Task(
-            recording=recording.name,
-            variant=variant.name,
-            source=recording.location,
-            folder=f"{recording.name}/{variant.name}" if len(variants) > 1 else recording.name,
-            config=variant.config,
+            recording=recording,
+            variant=variant,
+            source=location,
+            folder=f"{recording}/{variant}" if len(variants) > 1 else recording,
+            config=config,
             parameters=values,
         )
-        for recording in recordings
-        for variant, values in zip(variants, parameters, strict=True)
+        for recording, location in recordings.items()
+        for (variant, config), values in zip(variants.items(), parameters, strict=True)
     ]
 
 

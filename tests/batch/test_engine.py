@@ -14,7 +14,7 @@ import pytest
 from distributed import Client
 
 from gvo.batch.engine import BatchProgress, Engine, connected
-from gvo.batch.inputs import NamedRecording, make_variants
+from gvo.batch.inputs import make_variants
 from gvo.batch.running import make_tasks
 from gvo.batch.tasks import MARK, Task, TaskOptions
 from tests.batch.conftest import NO_REPORT, is_complete, wait_until
@@ -30,10 +30,7 @@ def options(tmp_path: Path) -> TaskOptions:
 
 
 def tasks_of(*sources: object) -> list[Task]:
-    recordings = [
-        NamedRecording(name=f"r{number}", location=str(source))
-        for number, source in enumerate(sources)
-    ]
+    recordings = {f"r{number}": str(source) for number, source in enumerate(sources)}
     return make_tasks(recordings, make_variants())
 
 

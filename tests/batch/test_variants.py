@@ -8,12 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gvo.batch import Variant, make_variants
+from gvo.batch import make_variants
 from gvo.errors import ConfigurationError
-
-
-def values_of(variant: Variant) -> tuple[int | None, int]:
-    return variant.config.window.size, variant.config.window.n_links
 
 
 @given(
@@ -26,9 +22,8 @@ def test_values_are_taken_as_they_are_written(sizes: list[int], gates: list[floa
         f"window.gate={','.join(map(repr, gates))}",
     ]
     variants = make_variants(sweeps=sweeps)
-    found = [(variant.config.window.size, variant.config.window.gate) for variant in variants]
+    found = [(config.window.size, config.window.gate) for config in variants.values()]
     assert found == list(itertools.product(sizes, gates))
-    assert len({variant.name for variant in variants}) == len(variants)
 
 
 def test_files_of_one_name_are_told_apart_and_one_file_is_one(tmp_path: Path) -> None:
@@ -37,8 +32,8 @@ def test_files_of_one_name_are_told_apart_and_one_file_is_one(tmp_path: Path) ->
         file.parent.mkdir()
         file.write_text(f"window: {{size: {size}}}\n")
     variants = make_variants([*files, files[0]])
-    assert [each.name for each in variants] == ["base", "base-2", "base-3"]
-    assert [values_of(each)[0] for each in variants] == [3, 4, 5]
+    sizes = [(name, config.window.size) for name, config in variants.items()]
+    assert sizes == [("base", 3), ("base-2", 4), ("base-3", 5)]
 
 
 def test_who_asks_for_threads_gets_them(tmp_path: Path) -> None:
@@ -49,9 +44,10 @@ def test_who_asks_for_threads_gets_them(tmp_path: Path) -> None:
         {"sweeps": ["runtime.threads=3"]},
     ]
     for one in asked:
-        assert make_variants(**one)[0].config.runtime.threads == 3
-    (variant,) = make_variants(settings=["window.size=4"])
-    assert variant.config.runtime.threads == 1
+        (config,) = make_variants(**one).values()
+        assert config.runtime.threads == 3
+    (config,) = make_variants(settings=["window.size=4"]).values()
+    assert config.runtime.threads == 1
 
 
 @pytest.mark.parametrize(
