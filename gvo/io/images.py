@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import stat
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gvo.config import ImagesConfig
 from gvo.errors import RecordingError
 from gvo.io.png import MAGIC, decode_plain_png, is_png_complete, size_of_png
 from gvo.types import DepthArray, ImageArray
@@ -47,49 +47,10 @@ MAX_COUNT = 65534
 _TOLERANCE = 5e-3
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GreyRange:
-    """Which values of 16-bit images become black and white.
-
-    Cameras of 10, 12 or 14 bits fill the lower bits of 16, thermal ones a part in the middle, and
-    no encoding tells. The range is one for the whole recording: a gain chosen for each frame
-    would change the brightness of what is tracked.
-
-    Parameters
-    ----------
-    black : int
-        This value and all below become 0.
-    white : int
-        This value and all above become 255.
-
-    Examples
-    --------
-    >>> GreyRange(white=4095).narrow(np.array([0, 15, 16, 4095, 9000], np.uint16)).tolist()
-    [0, 0, 1, 255, 255]
-    """
-
-    black: int = 0
-    white: int = 65535
-
-    def __post_init__(self) -> None:
-        """Check the range."""
-        if not 0 <= self.black < self.white <= 65535:
-            raise ValueError(
-                f"expected 0 <= black < white <= 65535, got black={self.black} white={self.white}"
-            )
-
-    def narrow(self, values: NDArray[np.uint16]) -> ImageArray:
-        """Return values of 8 bits: for the full range the upper eight."""
-        if self == FULL_RANGE:
-            return (values >> 8).astype(np.uint8)
-        above = np.clip(values, self.black, self.white).astype(np.uint32) - np.uint32(self.black)
-        return (above * 256 // (self.white + 1 - self.black)).astype(np.uint8)
+_FULL_RANGE = ImagesConfig()
 
 
-FULL_RANGE = GreyRange()
-
-
-def read_image(path: Path, grey_range: GreyRange = FULL_RANGE) -> ImageArray:
+def read_image(path: Path, grey_range: ImagesConfig = _FULL_RANGE) -> ImageArray:
     """Return the grey (h, w) or BGR (h, w, 3) pixels, 8 bits, of a PNG, JPEG, TIFF, BMP or PNM."""
     return to_8_bit(decode_image(_read_bytes(path), str(path)), str(path), grey_range)
 
@@ -148,8 +109,15 @@ def decode_image(data: NDArray[np.uint8], where: str) -> NDArray[Any]:
     return np.asarray(pixels)
 
 
-def to_8_bit(pixels: NDArray[Any], where: str, grey_range: GreyRange = FULL_RANGE) -> ImageArray:
-    """Return grey (h, w) or BGR (h, w, 3) pixels of 8 bits; alpha is dropped."""
+def to_8_bit(
+    pixels: NDArray[Any], where: str, grey_range: ImagesConfig = _FULL_RANGE
+) -> ImageArray:
+    """Return grey (h, w) or BGR (h, w, 3) pixels of 8 bits; alpha is dropped.
+
+    Cameras of 10, 12 or 14 bits fill the lower bits of 16, thermal ones a part in the middle, and
+    no encoding tells. The range is one for the whole recording: a gain chosen for each frame
+    would change the brightness of what is tracked.
+    """
     channels = pixels.shape[2] if pixels.ndim == 3 else 1
     if pixels.dtype not in (np.uint8, np.uint16) or channels not in (1, 3, 4):
         raise RecordingError(
@@ -158,7 +126,7 @@ def to_8_bit(pixels: NDArray[Any], where: str, grey_range: GreyRange = FULL_RANG
         )
     if pixels.dtype == np.uint16:
         _check_brightness(int(pixels.max(initial=0)), grey_range, where)
-        pixels = grey_range.narrow(pixels)
+        pixels = _narrow(pixels, grey_range)
     if pixels.ndim == 3 and channels == 1:
         pixels = pixels[:, :, 0]
     if channels == 4:
@@ -166,8 +134,17 @@ def to_8_bit(pixels: NDArray[Any], where: str, grey_range: GreyRange = FULL_RANG
     return np.ascontiguousarray(pixels)
 
 
-def _check_brightness(largest: int, grey_range: GreyRange, where: str) -> None:
-    if grey_range == FULL_RANGE and largest < _TOO_DARK:
+def _narrow(values: NDArray[np.uint16], grey_range: ImagesConfig) -> ImageArray:
+    """Return values of 8 bits: for the full range the upper eight."""
+    if grey_range == _FULL_RANGE:
+        return (values >> 8).astype(np.uint8)
+    black, white = grey_range.black, grey_range.white
+    above = np.clip(values, black, white).astype(np.uint32) - np.uint32(black)
+    return (above * 256 // (white + 1 - black)).astype(np.uint8)
+
+
+def _check_brightness(largest: int, grey_range: ImagesConfig, where: str) -> None:
+    if grey_range == _FULL_RANGE and largest < _TOO_DARK:
         n_bits = max(8, largest.bit_length())
         raise RecordingError(
             f"{where}: the 16-bit image is nearly black, its largest value is {largest} of 65535; "

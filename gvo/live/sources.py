@@ -38,7 +38,7 @@ from gvo.io.bag.messages import (
 )
 from gvo.io.bag.reader import typestore
 from gvo.io.bag.topics import COMPRESSED_TYPE, IMAGE_TYPE
-from gvo.io.images import MILLIMETRES, GreyRange, check_size
+from gvo.io.images import MILLIMETRES, check_size
 from gvo.io.recording import RecordingInfo, StampedImage
 from gvo.trajectory.trajectory import Trajectory
 
@@ -81,7 +81,7 @@ class StandardInput:
         self.info, self._file = replace(info, name=_WHERE), _EndableFile(number)
         self._stream = io.BufferedReader(self._file)
         self._scale = config.depth.scale or depth_scale or MILLIMETRES
-        self._grey_range = GreyRange(black=config.images.black, white=config.images.white)
+        self._images_config = config.images
 
     def images(self) -> Iterator[StampedImage]:
         """Yield the images as they arrive, until `close`.
@@ -129,11 +129,11 @@ class StandardInput:
             packed = _message(COMPRESSED_TYPE, format=str(header["format"]), data=self._read(size))
             if is_depth:
                 return partial(decode_compressed_depth, packed, self._scale, _WHERE)
-            return partial(decode_compressed, packed, _WHERE, self._grey_range)
+            return partial(decode_compressed, packed, _WHERE, self._images_config)
         raw = self._read_raw(header, is_depth=is_depth)
         if is_depth:
             return partial(decode_depth, raw, self._scale, _WHERE)
-        return partial(decode_grey_or_color, raw, _WHERE, self._grey_range)
+        return partial(decode_grey_or_color, raw, _WHERE, self._images_config)
 
     def _read_raw(self, header: dict[str, Any], *, is_depth: bool) -> Any:  # noqa: ANN401
         width, height = (_whole(header, name, lowest=1, highest=1 << 20) for name in _SIZES)

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
+from gvo.config import ImagesConfig
 from gvo.errors import RecordingError
 from gvo.io.images import (
     MAX_COUNT,
-    GreyRange,
     decode_image,
     depth_from_counts,
     depth_from_metres,
@@ -104,7 +104,7 @@ def test_a_range_keeps_order_and_has_black_and_white(black: int, span: int, seed
     white = min(black + span, 65535)
     values = np.sort(np.random.default_rng(seed).integers(0, 65536, 50)).astype(np.uint16)
     values[[0, -1]] = black, white
-    narrow = GreyRange(black=black, white=white).narrow(np.sort(values))
+    narrow = to_8_bit(np.sort(values), "image", ImagesConfig(black=black, white=white))
     assert np.all(np.diff(narrow.astype(int)) >= 0)
     assert np.all(narrow[np.sort(values) <= black] == 0)
     # with fewer than 256 steps the last one begins below 255
@@ -117,7 +117,7 @@ def test_nearly_black_images_are_refused_with_what_to_set(largest: int, white: i
     pixels = np.full((4, 4), largest, np.uint16)
     with pytest.raises(RecordingError, match=f"images.white={white}$"):
         to_8_bit(pixels, "image")
-    assert to_8_bit(pixels, "image", GreyRange(white=white)).max() > 64
+    assert to_8_bit(pixels, "image", ImagesConfig(white=white)).max() > 64
     assert to_8_bit(pixels + np.uint16(4096), "image").max() >= 16
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gvo._text import cut
+from gvo.config import ImagesConfig
 from gvo.geometry import se3
 from gvo.io.bag.image_encodings import (
     BAYER,
@@ -23,8 +24,6 @@ from gvo.io.bag.image_encodings import (
 )
 from gvo.io.calibration.camera_info import CameraFields, RegionOfInterest
 from gvo.io.images import (
-    FULL_RANGE,
-    GreyRange,
     decode_image,
     depth_from_counts,
     depth_from_metres,
@@ -39,6 +38,7 @@ if TYPE_CHECKING:
 
     from gvo.io.bag.reader import BagMessage
 
+_FULL_RANGE = ImagesConfig()
 _NORM_TOLERANCE = 1e-2  # of quaternions
 # After the number of ROS 1, or the encoding of CDR, of four bytes.
 _STAMP_END = 12
@@ -82,7 +82,7 @@ def transform_of(translation: Any, rotation: Any) -> FloatArray | Failure:  # no
 
 
 def decode_grey_or_color(
-    message: ros.sensor_msgs__msg__Image, where: str, grey_range: GreyRange = FULL_RANGE
+    message: ros.sensor_msgs__msg__Image, where: str, grey_range: ImagesConfig = _FULL_RANGE
 ) -> ImageArray:
     """Return the pixels of an `Image` message.
 
@@ -92,7 +92,7 @@ def decode_grey_or_color(
         Of an encoding in `gvo.io.bag.image_encodings.IMAGES`.
     where : str
         The topic, for messages.
-    grey_range : GreyRange
+    grey_range : ImagesConfig
         Of encodings with 16 bits.
 
     Returns
@@ -138,7 +138,9 @@ def decode_depth(message: ros.sensor_msgs__msg__Image, scale: float, where: str)
 
 
 def decode_compressed(
-    message: ros.sensor_msgs__msg__CompressedImage, where: str, grey_range: GreyRange = FULL_RANGE
+    message: ros.sensor_msgs__msg__CompressedImage,
+    where: str,
+    grey_range: ImagesConfig = _FULL_RANGE,
 ) -> ImageArray:
     """Return the pixels of a `CompressedImage` message.
 
@@ -149,7 +151,7 @@ def decode_compressed(
         "jpeg", "rgb8; jpeg compressed bgr8", "bayer_rggb8; png compressed ".
     where : str
         The topic, for messages.
-    grey_range : GreyRange
+    grey_range : ImagesConfig
         Of images with 16 bits.
 
     Returns

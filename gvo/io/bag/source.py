@@ -31,7 +31,7 @@ from gvo.io.bag.topics import (
     choose_topics,
 )
 from gvo.io.calibration.files import CalibrationPaths, paths_of
-from gvo.io.images import MILLIMETRES, GreyRange
+from gvo.io.images import MILLIMETRES
 from gvo.io.poses.tf import TfBuffer, read_tf
 from gvo.io.poses.truth import (
     TRUTH_FRAMES,
@@ -134,7 +134,7 @@ class BagSource:
             found = calibrations_of_messages(reader, self._topics, where, topics.camera_info)
         self._info_names = set(found.info_names)
         self._scale = config.depth.scale or found.depth_scale or MILLIMETRES
-        self._grey_range = GreyRange(black=config.images.black, white=config.images.white)
+        self._images_config = config.images
         self.info = self._describe(found)
 
     @property
@@ -275,7 +275,7 @@ class BagSource:
             decode_counts = decode_compressed_depth if is_compressed else decode_depth
             return partial(decode_counts, scale=self._scale, where=topic.name)
         decode = decode_compressed if is_compressed else decode_grey_or_color
-        return partial(decode, where=topic.name, grey_range=self._grey_range)
+        return partial(decode, where=topic.name, grey_range=self._images_config)
 
 
 def _describe_parts(paths: Sequence[Path], reader: BagReader, reason: str) -> str:

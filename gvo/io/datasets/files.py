@@ -14,7 +14,7 @@ from gvo._text import cut, text_lines
 from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.io.calibration.files import CameraSet
-from gvo.io.images import GreyRange, read_image
+from gvo.io.images import read_image
 from gvo.io.recording import RecordingInfo, Sensor, StampedImage, shown
 from gvo.trajectory.trajectory import parse_stamp
 
@@ -85,8 +85,7 @@ class FolderSource:
 
 def loader(config: Config | None) -> Load:
     """Return what loads a grey or colour image, its 16 bits reduced as configured."""
-    images = (config or Config()).images
-    return partial(read_image, grey_range=GreyRange(black=images.black, white=images.white))
+    return partial(read_image, grey_range=(config or Config()).images)
 
 
 def image_size(rows: Sequence[StampedPath], config: Config | None) -> tuple[int, int]:
