@@ -39,72 +39,7 @@ Value: TypeAlias = bool | int | float | str | None
 Kind = Literal["switch", "choice", "integer", "number"]
 _WIDEST_SLIDER = 1000.0
 # Parameters that there are no more, and the values at which they are fixed.
-_FIXED: Mapping[str, Value] = {
-    "check.fault_lost_share": 0.2,
-    "check.max_blur_px": 1.6,
-    "check.max_brightness": 230.0,
-    "check.max_clipped_share": 0.3,
-    "check.max_clock_drift_ms_per_min": 60.0,
-    "check.max_clock_jump_ms": 100.0,
-    "check.max_depth_difference_ms": 10.0,
-    "check.max_depth_median_m": 50.0,
-    "check.max_exposure_ratio": 1.3,
-    "check.max_gap_s": 0.5,
-    "check.max_jitter": 0.3,
-    "check.max_lens_k1": 0.15,
-    "check.max_lost_share": 0.05,
-    "check.max_misregistration_px": 3.0,
-    "check.max_negative_share": 0.1,
-    "check.max_row_offset_px": 0.75,
-    "check.max_row_spread_px": 2.0,
-    "check.max_stereo_difference_ms": 2.0,
-    "check.max_tf_gap_s": 0.5,
-    "check.max_unknown_depth": 0.5,
-    "check.min_brightness": 25.0,
-    "check.min_corners": 80,
-    "check.min_depth_in_range": 0.5,
-    "check.min_depth_levels": 64,
-    "check.min_depth_median_m": 0.2,
-    "check.min_followed_share": 0.3,
-    "check.min_stereo_matches": 60,
-    "check.n_samples": 12,
-    "depth.icp": "auto",
-    "depth.virtual_baseline_m": 0.075,
-    "features.low_fast_threshold": 7,
-    "klt.cell_size_px": 40,
-    "klt.disparity_sigma_px": 0.15,
-    "klt.max_return_px": 0.5,
-    "klt.min_distance_px": 10,
-    "klt.min_eigenvalue": 1e-4,
-    "klt.n_levels": 2,
-    "klt.n_wide_levels": 4,
-    "klt.pixel_sigma_px": 0.15,
-    "klt.sigma_factor": 2.4,
-    "klt.window_radius_px": 4,
-    "registration.gate": 3.0,
-    "registration.huber": 1.5,
-    "registration.n_iterations": 10,
-    "registration.pixel_sigma_px": 0.7,
-    "registration.sigma_factor": 1.2,
-    "stereo.offset_sigma_px": 0.1,
-    "stereo.patch_radius_px": 5,
-    "stereo.search_radius_px": 3,
-    "stereo.sigma_px": 0.3,
-    "sync.age_penalty": 0.1,
-    "sync.queue_size": 100,
-    "temporal.wide_radius_px": "four times temporal.radius_px",
-    "window.coasting_sigma_deg_per_s": 30.0,
-    "window.coasting_sigma_m_per_s": 3.0,
-    "window.kernel_threshold": None,
-    "window.keyframe_overlap": 0.9,
-    "window.link_gain": 2.0,
-    "window.lost_after_s": 2.0,
-    "window.min_overlap": 0.4,
-    "window.zero_motion": False,
-    "window.zero_motion_flow_px": 1.0,
-    "window.zero_motion_gate": 5.0,
-    "window.zero_motion_sigma_factor": 1.0,
-}
+_FIXED = Path(__file__).with_name("fixed_parameters.yaml")
 # what a number starts from where its default is null
 _STARTS: Mapping[tuple[str, str], float] = {
     ("depth", "scale"): 1000.0,
@@ -410,8 +345,9 @@ def _explain(error: ValidationError) -> str:
     gone = name
     if isinstance(first["input"], Mapping):  # a whole section
         gone = ".".join([name, *map(str, first["input"])][:2])
-    if gone in _FIXED:
-        return f"{gone} is no parameter any more: it is fixed at {_yaml(_FIXED[gone])}"
+    fixed = load_yaml(read_text(_FIXED, max_bytes=MAX_CHARACTERS))
+    if gone in fixed:
+        return f"{gone} is no parameter any more: it is fixed at {_yaml(fixed[gone])}"
     known = list(values_by_name(Config()) if "." in name else sections())
     nearest = difflib.get_close_matches(name, known, n=1, cutoff=0.0)[0]
     return f"unknown key {name}: did you mean {nearest}? `gvo config --all` lists all"
