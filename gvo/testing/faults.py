@@ -68,14 +68,6 @@ class Fault:
         """Yield the images of both streams, in the order of the recording, with the fault."""
         yield from images
 
-    def change_info(self, info: RecordingInfo) -> RecordingInfo:
-        """Return the description of the recording, with the fault."""
-        return info
-
-    def rng(self, image: FaultyImage) -> np.random.Generator:
-        """Return the random generator of one image."""
-        return np.random.default_rng([self.seed, image.frame, image.given.stream])
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dropped(Fault):
@@ -149,11 +141,8 @@ class FaultySource:
 
     @property
     def info(self) -> RecordingInfo:
-        """What is known before the first image, with the faults of the calibration."""
-        info = self._source.info
-        for fault in self.faults:
-            info = fault.change_info(info)
-        return info
+        """What is known before the first image."""
+        return self._source.info
 
     def images(self) -> Iterator[StampedImage]:
         """Yield the images with the faults."""

@@ -12,8 +12,9 @@ import cv2
 import pytest
 
 from gvo.io.recording import Sensor, Source
-from gvo.testing.faults import Fault, FaultySource, PixelFault
+from gvo.testing.faults import Fault, PixelFault
 from tests import faults as made
+from tests.faults.delivery import FaultySource
 from tests.faults.images import of_all, of_depth, spoilt
 
 PAGE = Path(__file__).parents[2] / "docs/SECURITY.md"

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from gvo import testing
 from gvo.errors import RecordingError
 from gvo.io.recording import RecordingInfo, Source
 from gvo.testing.faults import Fault, FaultyImage, Pixels
@@ -209,6 +210,17 @@ class Miscalibrated(Fault):
             for stream, each in enumerate(info.calibrations)
         )
         return replace(info, calibrations=calibrations)
+
+
+class FaultySource(testing.FaultySource):
+    """A recording with faults, also of its calibration."""
+
+    @property
+    def info(self) -> RecordingInfo:
+        info = super().info
+        for fault in self.faults:
+            info = fault.change_info(info) if isinstance(fault, Miscalibrated) else info
+        return info
 
 
 def wrong_baseline(factor: float) -> Miscalibrated:

@@ -18,12 +18,13 @@ from gvo.errors import GvoError
 from gvo.geometry import se3
 from gvo.io.recording import Sensor
 from gvo.io.synthetic import SyntheticRecording
-from gvo.testing.faults import FaultyImage, FaultySource
+from gvo.testing.faults import FaultyImage
 from gvo.trajectory.formats import read_covariances, read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
 from tests.conftest import run_of
 from tests.faults.catalogue import NamedFault
+from tests.faults.delivery import FaultySource
 from tests.make.recordings import Held, hold
 
 _SCALE = 0.4

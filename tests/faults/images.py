@@ -28,7 +28,8 @@ class Spoilt(PixelFault):
         return self.of == "all" or is_depth == (self.of == "depth")
 
     def spoil(self, pixels: Pixels, image: FaultyImage) -> Pixels:
-        return self.by(pixels, image.frame, self.rng(image))
+        rng = np.random.default_rng([self.seed, image.frame, image.given.stream])
+        return self.by(pixels, image.frame, rng)
 
 
 def spoilt(by: Callable[..., Pixels], of: Part = "light", **values: Any) -> Spoilt:

@@ -9,8 +9,16 @@ import numpy as np
 import pytest
 
 from gvo.io.recording import Sensor
-from gvo.testing import FaultySource
-from tests.faults import Elsewhere, Exchanged, Frozen, Lagging, PixelFault, rows_shifted, spoilt
+from tests.faults import (
+    Elsewhere,
+    Exchanged,
+    FaultySource,
+    Frozen,
+    Lagging,
+    PixelFault,
+    rows_shifted,
+    spoilt,
+)
 from tests.faults.catalogue import FAULTS, MADE, PAGE, NamedFault, parameters
 from tests.faults.fault_bench import Outcome, complaints, faulty, run, sound
 

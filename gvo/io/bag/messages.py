@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -64,20 +65,28 @@ def bare(name: str) -> str:
     return name.removeprefix("/")
 
 
-def transform_of(translation: Any, rotation: Any) -> FloatArray | Failure:  # noqa: ANN401
-    """Return T, shape (4, 4), of a translation in metres and a quaternion of length one.
+def pose_fault(pose: Sequence[float]) -> str:
+    """Say why x, y, z, qx, qy, qz, qw are no pose in metres; empty if they are one.
 
-    The length may be off by a hundredth. The failure says what is wrong with the numbers.
+    The length of the quaternion may be off by a hundredth.
     """
+    if not all(map(math.isfinite, pose)):
+        return "the numbers are not finite"
+    if any(abs(number) > MAX_POSITION_M for number in pose):
+        return f"a number is beyond {MAX_POSITION_M:g}"
+    norm = math.hypot(*pose[3:])
+    if abs(norm - 1.0) > _NORM_TOLERANCE:
+        return f"the quaternion has the norm {norm:.3g}, expected 1"
+    return ""
+
+
+def transform_of(translation: Any, rotation: Any) -> FloatArray | Failure:  # noqa: ANN401
+    """Return T, shape (4, 4), of a translation in metres and a quaternion; see `pose_fault`."""
     t = np.array([getattr(translation, axis) for axis in "xyz"], dtype=np.float64)
     quaternion_xyzw = np.array([getattr(rotation, axis) for axis in "xyzw"])
-    if not np.all(np.isfinite(t)):
-        return Failure(reason="the position is not finite")
-    if np.any(np.abs(t) > MAX_POSITION_M):
-        return Failure(reason=f"the position is beyond {MAX_POSITION_M:g} m")
-    norm = math.hypot(*quaternion_xyzw)
-    if not abs(norm - 1.0) <= _NORM_TOLERANCE:
-        return Failure(reason=f"the quaternion has the norm {norm:.3g}, expected 1")
+    fault = pose_fault([*t.tolist(), *quaternion_xyzw.tolist()])
+    if fault:
+        return Failure(reason=fault)
     return se3.make_transform(np.asarray(Rotation.from_quat(quaternion_xyzw).as_matrix()), t)
 
 

@@ -252,24 +252,24 @@ def find_files(folder: Path) -> FolderFiles:
     has_metadata = (folder / "metadata.yaml").is_file()
     if not held and not has_metadata:
         raise RecordingError(f"{folder}: holds neither metadata.yaml nor a .mcap or .db3")
-    counts = _listed_files(folder / "metadata.yaml") if has_metadata else {}
-    listed = {name: _find(name, held) for name in counts}
+    names = _listed_files(folder / "metadata.yaml") if has_metadata else []
+    listed = {name: _find(name, held) for name in names}
     found = tuple(path for path in listed.values() if path is not None)
     if not found:
         if not held:
             raise RecordingError(
                 f"{folder}: holds no .mcap or .db3, only metadata.yaml; copy it anew"
             )
-        state = "names other files" if counts else "is malformed" if has_metadata else "is missing"
-        names = ", ".join(path.name for path in held)
-        note = f"bag: metadata.yaml {state}: read {names} without it"
+        state = "names other files" if names else "is malformed" if has_metadata else "is missing"
+        read = ", ".join(path.name for path in held)
+        note = f"bag: metadata.yaml {state}: read {read} without it"
         return FolderFiles(paths=tuple(held), notes=(note,), is_listed=False)
     others = [path.name for path in held if path not in found]
     return FolderFiles(
         paths=found,
         notes=tuple(f"bag: {name} is left out: metadata.yaml does not name it" for name in others),
         damage=tuple(
-            f"{folder / name}: is missing{counts[name]}; copy it anew"
+            f"{folder / name}: is missing; copy it anew"
             for name, path in listed.items()
             if path is None
         ),
@@ -282,19 +282,13 @@ def _find(name: str, held: list[Path]) -> Path | None:
     return next((path for wanted in names for path in held if path.name == wanted), None)
 
 
-def _listed_files(metadata: Path) -> dict[str, str]:
-    """Return the names of the files, each with what is known of its size, as text."""
+def _listed_files(metadata: Path) -> list[str]:
     try:
         text = read_text(metadata, max_bytes=_MAX_METADATA)
         content = load_yaml(text, max_characters=_MAX_METADATA)["rosbag2_bagfile_information"]
-        names = [PurePath(name).name for name in content["relative_file_paths"]]
-        files = {
-            PurePath(file["path"]).name: f" ({file['message_count']} messages)"
-            for file in content.get("files") or []
-        }
+        return [PurePath(name).name for name in content["relative_file_paths"]]
     except (YamlError, OSError, ValueError, TypeError, LookupError, AttributeError):
-        return {}
-    return {name: files.get(name, "") for name in names}
+        return []
 
 
 def is_storage(path: Path) -> bool:

@@ -246,7 +246,7 @@ def _distortion(fields: CameraFields, *, is_rectified: bool) -> tuple[Distortion
     if D.size not in counts:
         raise CalibrationError(
             f"{fields.where}: D of {cut(' '.join(fields.model.split()), MAX_SHOWN)} must hold "
-            f"{_alternatives(counts)} numbers, got {D.size}"
+            f"{' or '.join(map(str, sorted(counts)))} numbers, got {D.size}"
         )
     n_missing = max(N_COEFFICIENTS[model][0] - D.size, 0)
     return model, np.concatenate([D, np.zeros(n_missing)])
@@ -267,11 +267,6 @@ def supported_model(name: str, where: str) -> DistortionModel:
 def known_model(name: str) -> DistortionModel | None:
     """Return the model that a system calls so; None if it is not supported."""
     return _MODELS.get("_".join(name.lower().replace("-", " ").split()))
-
-
-def _alternatives(counts: set[int]) -> str:
-    *most, last = (str(count) for count in sorted(counts))
-    return f"{', '.join(most)} or {last}" if most else last
 
 
 def read_numbers(values: object, what: str) -> FloatArray:

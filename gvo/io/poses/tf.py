@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from array import array
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -14,10 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from gvo.errors import RecordingError
 from gvo.geometry import se3
-from gvo.io.bag.messages import bare, stamp_of
+from gvo.io.bag.messages import bare, pose_fault, stamp_of
 from gvo.io.bag.reader import OLD_TF_TYPE, TF_TYPE, MessageReader
 from gvo.io.edges.events import InputFaults
-from gvo.trajectory.formats import MAX_POSITION_M
 from gvo.trajectory.trajectory import format_stamp
 from gvo.types import BoolArray, Failure, FloatArray, IntArray
 
@@ -25,7 +23,6 @@ TF_TYPES = (TF_TYPE, OLD_TF_TYPE)
 """Message types that hold transforms between named frames."""
 
 _N_NUMBERS = 7
-_SQUARED_NORM_TOLERANCE = 1e-2  # of quaternions, as in tf2
 N_KEPT_WHOLE = 200_000
 """Up to here all transforms are kept, 14 MB; beyond it what was asked for."""
 _N_LISTED = 12
@@ -362,14 +359,7 @@ def _fault(parent: str, child: str, pose: tuple[float, ...]) -> str:
         return "a name is empty"
     if parent == child:
         return "a frame cannot be its own parent"
-    if not all(map(math.isfinite, pose)):
-        return "the numbers are not finite"
-    if any(abs(number) > MAX_POSITION_M for number in pose):
-        return f"a number is beyond {MAX_POSITION_M:g}"
-    squared_norm = sum(number * number for number in pose[3:])
-    if abs(squared_norm - 1.0) >= _SQUARED_NORM_TOLERANCE:
-        return f"the quaternion has the norm {math.sqrt(squared_norm):.3g}, expected 1"
-    return ""
+    return pose_fault(pose)
 
 
 class _Path(NamedTuple):
