@@ -12,7 +12,7 @@ from itertools import product
 from pathlib import Path
 from typing import TypeVar
 
-from gvo._text import YamlError, cut, load_yaml
+from gvo._text import YamlError, cut, load_yaml, text_lines
 from gvo.batch.results import CSV
 from gvo.batch.tasks import MARK, Value
 from gvo.config import Config, RuntimeConfig, load_configuration, values_by_name
@@ -30,6 +30,7 @@ _COMPRESSED = ".zstd"
 _TAKEN = {f"{name}{end}" for name in (CSV, REPORT, MARK) for end in ("", ".new")}
 DEFAULT = "default"
 _MAX_SHOWN = 100
+_MAX_LISTED = 1_000_000  # lines of a list of recordings
 _MAX_VARIANTS = 100_000
 
 
@@ -39,8 +40,9 @@ def find_recordings(asked: Sequence[str | Path]) -> dict[str, str]:
     Parameters
     ----------
     asked : sequence of str or Path
-        Each a path of a recording, or a folder, which is searched unless it is a recording itself.
-        A path that does not exist is taken for a recording that only the workers see.
+        Each a path of a recording, a folder, which is searched unless it is a recording itself, or
+        a `.txt` file with one of these a line, relative to its folder. A path that does not exist
+        is taken for a recording that only the workers see.
 
     Returns
     -------
@@ -59,12 +61,20 @@ def find_recordings(asked: Sequence[str | Path]) -> dict[str, str]:
     locations: dict[str, None] = {}
     for one in asked:
         # Links are not resolved: on a worker they may lead elsewhere.
-        place = Path(os.path.abspath(Path(one).expanduser()))  # noqa: PTH100
-        found = [*map(str, _search_below(place))]
+        places = [Path(os.path.abspath(each)) for each in _paths(Path(one).expanduser())]  # noqa: PTH100
+        found = [str(each) for place in places for each in _search_below(place)]
         if not found:
             raise RecordingError(f"{one}: no recording there")
         locations.update(dict.fromkeys(found))
     return _name(list(locations))
+
+
+def _paths(path: Path) -> list[Path]:
+    """Return the paths in a list, or the path itself."""
+    if path.suffix != ".txt" or not path.is_file():
+        return [path]
+    lines = (line.strip() for _, line in text_lines(path, RecordingError, max_lines=_MAX_LISTED))
+    return [path.parent / line for line in lines if line and not line.startswith("#")]
 
 
 def _search_below(place: Path, depth: int = 0) -> Iterator[Path]:

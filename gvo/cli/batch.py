@@ -26,7 +26,7 @@ _MAX_WARNINGS = 20
 def batch(
     recordings: Annotated[
         list[str],
-        Argument(metavar="RECORDING...", help="Recordings, or folders to search."),
+        Argument(metavar="RECORDING...", help="Recordings, folders to search, lists (.txt)."),
     ],
     out: Annotated[Path, Option(metavar="DIR", help="Folder to write.")],
     *,

@@ -50,6 +50,19 @@ def test_the_files_of_a_bag_folder_are_no_recordings_of_their_own(tmp_path: Path
     assert [*find_recordings([tmp_path])] == ["drive", "drive-2"]
 
 
+def test_a_list_has_one_recording_a_line(tmp_path: Path) -> None:
+    make_files(tmp_path, "in/a.bag", "in/b#1.bag", "more/c.bag", "more/d.mcap")
+    (tmp_path / "in" / "list.txt").write_bytes(
+        b"\xef\xbb\xbf# recordings\r\na.bag\r\n\r\n  b#1.bag\n../more\n/not/here.bag"
+    )
+    found = find_recordings([tmp_path / "in" / "list.txt"]).values()
+    places = ["in/a.bag", "in/b#1.bag", "more/c.bag", "more/d.mcap"]
+    assert [*found] == [*(str(tmp_path / place) for place in places), "/not/here.bag"]
+    (tmp_path / "list.txt").write_bytes(b"\xff\xfe")
+    with pytest.raises(RecordingError, match=r"list\.txt: is no text file"):
+        find_recordings([tmp_path / "list.txt"])
+
+
 def test_an_empty_folder_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=f"{re.escape(str(tmp_path))}: no recording there"):
         find_recordings([tmp_path])
