@@ -350,18 +350,11 @@ def compare(
         name: _by_clock(truth, each, name, offset) for name, each in trajectories.items()
     }
     lengths = None if segments is None else _parse_lengths(segments)
-    max_difference_ns = round(1e9 * max_difference)
+    how: dict[str, Any] = {"align": align, "max_difference_ns": round(1e9 * max_difference)}
+    of_segments: dict[str, Any] = {"segments": lengths, "segment_step": segment_step}
     evaluations = [
-        evaluate(
-            truth,
-            trajectory,
-            name=name,
-            align=align,
-            segments=lengths,
-            segment_step=segment_step,
-            max_difference_ns=max_difference_ns,
-        )
-        for name, trajectory in trajectories.items()
+        evaluate(truth, each, name=name, **how, **of_segments)
+        for name, each in trajectories.items()
     ]
     if as_json:
         typer.echo(json.dumps(evaluations_json(evaluations), allow_nan=False))
@@ -371,9 +364,7 @@ def compare(
     if plot is not None:
         from gvo.viz.plots import plot_trajectories
 
-        plot_trajectories(
-            plot, truth, trajectories, align=align, max_difference_ns=max_difference_ns
-        )
+        plot_trajectories(plot, truth, trajectories, **how)
     if report_file is not None or plots is not None:
         from gvo.viz.report import write_comparison_report
 

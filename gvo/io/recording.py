@@ -37,6 +37,8 @@ class StampedImage:
     load : callable
         Returns the raw pixels: uint8 (h, w) grey or (h, w, 3) in BGR order; depth as float32
         metres (h, w), NaN = unknown. Raises `RecordingError` where the image is faulty.
+    log_time_ns : int, optional
+        When it was recorded, by the recording's own clock; None where there is no such clock.
     n_bytes : int
         Memory that it holds until it is loaded, where that is known.
     """
@@ -44,6 +46,7 @@ class StampedImage:
     stream: int
     stamp_ns: int
     load: Callable[[], NDArray[Any]]
+    log_time_ns: int | None = None
     n_bytes: int = 0
 
 

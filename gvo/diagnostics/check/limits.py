@@ -80,6 +80,11 @@ RULES: Mapping[str, Rule] = {
     "stamp difference": Rule(
         unit="ms", fix="trigger both by hardware, or take a shared offset off the stamps"
     ),
+    # Messages are late at random by some ten milliseconds; a thousandth more for the drift of the
+    # clocks, of which those of quartz have a hundredth.
+    "recording clock": Rule(
+        unit="ms", fix="a clock was set or drifts (PTP and NTP hold it), or recording stalled"
+    ),
     # A baseline outside is mostly one in a wrong unit.
     "baseline": Rule(
         low=0.01,

@@ -42,6 +42,8 @@ class Survey:
     ----------
     stamps_ns : tuple of two ndarray of int64, shape (n,)
         Of both streams, in the order of the recording.
+    log_times_ns : tuple of two ndarray of int64, shape (n,)
+        When these images were recorded; empty if the recording has no clock.
     n_pairs : int
         Number of frames that odometry gets.
     samples : tuple of Sample
@@ -51,6 +53,7 @@ class Survey:
     """
 
     stamps_ns: tuple[IntArray, IntArray]
+    log_times_ns: tuple[IntArray, IntArray]
     n_pairs: int
     samples: tuple[Sample, ...]
     damage: str
@@ -63,8 +66,10 @@ def survey(source: Source, config: Config, *, n_samples: int) -> Survey:
     if n_pairs == 0 and all(found.stamps_ns):
         found = _Pass(source, config, n_samples, limit_ms=_WIDE_LIMIT_MS)
     first, second = (np.array(each, dtype=np.int64) for each in found.stamps_ns)
+    first_log, second_log = (np.array(each, dtype=np.int64) for each in found.log_times_ns)
     return Survey(
         stamps_ns=(first, second),
+        log_times_ns=(first_log, second_log),
         n_pairs=n_pairs,
         samples=tuple(_load(source, config, found.chosen)),
         damage=found.damage,
@@ -78,6 +83,7 @@ class _Pass:
         self, source: Source, config: Config, n_samples: int, *, limit_ms: float | None = None
     ) -> None:
         self.stamps_ns = array("q"), array("q")
+        self.log_times_ns = array("q"), array("q")
         self.chosen: list[list[Pair]] = []
         self.n_pairs, self.damage = 0, ""
         last = max(source.info.n_images - 2, 0)
@@ -103,6 +109,8 @@ class _Pass:
     def _noted(self, source: Source) -> Iterator[StampedImage]:
         for image in source.images():
             self.stamps_ns[image.stream].append(image.stamp_ns)
+            if image.log_time_ns is not None:
+                self.log_times_ns[image.stream].append(image.log_time_ns)
             yield image
 
 

@@ -1,4 +1,4 @@
-"""Stamps: rates, gaps, partners."""
+"""Stamps: rates, gaps, partners, and the clock of the recording."""
 
 from __future__ import annotations
 
@@ -18,6 +18,10 @@ from gvo.types import FloatArray, IntArray
 
 # Length of a gap, periods; shorter intervals are jitter.
 _GAP_PERIODS = 2.5
+# The clock of the recording is compared by medians over stretches of it; limits of their spread,
+# and of how it grows.
+_N_STRETCHES = 20
+_MAX_CLOCK_MS, _MAX_DRIFT = 100.0, 1e-3
 # Near half a period, images are paired with the partners of others; streams that have nothing to
 # do with each other have differences of any size up to there.
 _MAX_SHARE_OF_PERIOD = 0.4
@@ -30,6 +34,10 @@ def check_timing(survey: Survey, info: RecordingInfo, config: Config) -> Iterato
         yield from _check_stream(name, stamps_ns, config)
     if all(len(stamps_ns) for stamps_ns in survey.stamps_ns):
         yield from _check_pairs(survey, info, config)
+    streams = zip(info.stream_names, survey.stamps_ns, survey.log_times_ns, strict=True)
+    for name, stamps_ns, log_times_ns in streams:
+        if len(stamps_ns) == len(log_times_ns) >= _N_STRETCHES:
+            yield _check_clock(name, stamps_ns, log_times_ns - stamps_ns)
 
 
 def _check_stream(name: str, stamps_ns: IntArray, config: Config) -> Iterator[Finding]:
@@ -116,3 +124,18 @@ def _nearest_differences(first_ns: IntArray, second_ns: IntArray) -> FloatArray:
     to_after, to_before = ordered[after] - first_ns, ordered[before] - first_ns
     is_before = np.abs(to_before) < np.abs(to_after)
     return np.asarray(np.where(is_before, to_before, to_after), dtype=np.float64)
+
+
+def _check_clock(name: str, stamps_ns: IntArray, delays_ns: IntArray) -> Finding:
+    """Compare the clock of the headers with that of the recording; a constant offset is harmless.
+
+    Messages are late at random, now and then very late: medians over stretches are compared.
+    """
+    parts = np.array_split(delays_ns / 1e6, _N_STRETCHES)
+    spread_ms = float(np.ptp([np.median(part) for part in parts]))
+    return measured(
+        f"{name}: recording clock",
+        spread_ms,
+        high=_MAX_CLOCK_MS + _MAX_DRIFT * float(np.ptp(stamps_ns)) / 1e6,
+        text=f"{np.median(delays_ns) / 1e9:.3g} s after the header, varies by {spread_ms:.3g} ms",
+    )

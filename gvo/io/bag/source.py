@@ -267,7 +267,13 @@ class BagSource:
         if log_time_ns != message.log_time_ns:
             reason = f"{message.topic.name}: recorded at {message.log_time_ns} ns, which is no time"
             load = partial(_fail, reason)
-        return StampedImage(stream=stream, stamp_ns=stamp_ns, load=load, n_bytes=len(message.data))
+        return StampedImage(
+            stream=stream,
+            stamp_ns=stamp_ns,
+            load=load,
+            log_time_ns=log_time_ns,
+            n_bytes=len(message.data),
+        )
 
     def _decoder(self, topic: Topic, stream: int) -> Callable[[Any], NDArray[Any]]:
         is_compressed = topic.type == COMPRESSED_TYPE

@@ -1,4 +1,4 @@
-"""Stamps: planted faults of rate, order and partners."""
+"""Stamps: planted faults of rate, order, partners and the recording's clock."""
 
 from __future__ import annotations
 
@@ -28,11 +28,13 @@ IS_FIRST_HALF = np.arange(300) < 150
 
 OF_STAMPS = (
     *("stamps", "period", "jitter", "gaps", "dropped frames", "stamp difference"),
-    "frames without partner",
+    *("frames without partner", "recording clock"),
 )
 
 
-def timing(colour: Stamps, depth: Stamps | None = None) -> dict[str, Finding]:
+def timing(
+    colour: Stamps, depth: Stamps | None = None, *, logs_ns: Stamps | None = None
+) -> dict[str, Finding]:
     """Check small plain images of these stamps; return what is told of the stamps."""
     streams = (colour, colour if depth is None else depth)
     images = [
@@ -40,6 +42,7 @@ def timing(colour: Stamps, depth: Stamps | None = None) -> dict[str, Finding]:
             stream=stream,
             stamp_ns=int(streams[stream][number]),
             load=partial(IMAGES.__getitem__, stream),
+            log_time_ns=None if logs_ns is None or stream else int(logs_ns[number]),
         )
         for _, stream, number in sorted(
             (number / len(stamps_ns), stream, number)
@@ -136,3 +139,23 @@ def test_a_tolerance_that_is_too_small_is_named_with_one_that_is_not() -> None:
     assert "--set sync.stereo_tolerance_ms=5" in finding.fix
     # The images are looked at all the same.
     assert find(result, "left/right: row offset").verdict == "ok"
+
+
+LATE = np.random.default_rng(1).exponential(2 * MS, 300)
+ELAPSED = REGULAR - REGULAR[0]
+
+
+@pytest.mark.parametrize(
+    ("delays_ns", "spread_ms"),
+    [
+        *((offset_ns + 4 * LATE, 0.0) for offset_ns in (0, 86_400_000 * MS, -5_000 * MS)),
+        (0.02 * ELAPSED + LATE, 190.0),
+        (np.where(np.arange(300) < 170, 2, 402) * MS, 400.0),
+    ],
+    ids=["late", "a day apart", "ahead", "drift", "set"],
+)
+def test_clocks_that_drift_or_are_set_are_found(delays_ns: Stamps, spread_ms: float) -> None:
+    findings = timing(REGULAR, logs_ns=REGULAR + delays_ns)
+    name = "colour: recording clock"
+    assert complaints(findings) == ({name} if spread_ms else set())
+    assert findings[name].value == pytest.approx(spread_ms, rel=0.1, abs=10.0)

@@ -101,7 +101,7 @@ def test_an_image_recorded_at_no_time_is_a_faulty_frame(
     assert [type(item) for item in read] == [StereoFrame] * 2 + [FaultyFrame]
     assert "is no time" in getattr(read[2], "reason", "")
     # as what looks through a recording before a run keeps them
-    assert len(array("q", [image.stamp_ns for image in source.images()])) == 6
+    assert len(array("q", [image.log_time_ns or 0 for image in source.images()])) == 6
 
 
 def test_a_calibration_file_replaces_camera_info(tmp_path: Path, tiny: Any) -> None:
