@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Literal
 
 from gvo.errors import ConfigurationError, RecordingError, named_faults
 from gvo.io.sync import Paired
@@ -87,16 +86,18 @@ def take_excerpt(items: Iterable[Paired], excerpt: Excerpt) -> Iterator[Paired]:
     if excerpt.is_everything:
         yield from items
         return
+    start_ns = round(1e9 * excerpt.start_s)
+    end_ns = math.inf if excerpt.duration_s is None else start_ns + round(1e9 * excerpt.duration_s)
     stamps: list[int] = []  # of the first and the latest item
     n_given = n_to_skip = 0
     for item in items:
         is_pair = not isinstance(item, FaultyFrame)
         stamp_ns = item.stamp_ns if isinstance(item, FaultyFrame) else item[0].stamp_ns
         stamps = [stamps[0], max(stamps[1], stamp_ns)] if stamps else [stamp_ns, stamp_ns]
-        place = _place(stamp_ns - stamps[0], excerpt)
-        if place == "after" and is_pair:
+        elapsed_ns = stamp_ns - stamps[0]
+        if elapsed_ns >= end_ns and is_pair:
             break
-        if place != "within":
+        if elapsed_ns >= end_ns or (start_ns > 0 and elapsed_ns < start_ns):
             continue
         if n_to_skip:
             n_to_skip -= is_pair
@@ -111,12 +112,3 @@ def take_excerpt(items: Iterable[Paired], excerpt: Excerpt) -> Iterator[Paired]:
             f"no frame at {excerpt.start_s:g} s or later{until}: the recording is {length_s:g} s "
             "long, or has a gap there; start elsewhere or take more"
         )
-
-
-def _place(since_first_ns: int, excerpt: Excerpt) -> Literal["before", "within", "after"]:
-    start_ns = round(excerpt.start_s * 1e9)
-    if excerpt.start_s > 0 and since_first_ns < start_ns:
-        return "before"
-    if excerpt.duration_s is None or since_first_ns < start_ns + round(excerpt.duration_s * 1e9):
-        return "within"
-    return "after"
