@@ -229,9 +229,8 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
     TrajectoryError
         If the file cannot be written.
     """
-    _check_rotations(trajectory)
     poses = zip(trajectory.stamps_ns, trajectory.T_world_frame, strict=True)
-    _write_lines(path, (format_tum_line(int(stamp_ns), T) for stamp_ns, T in poses))
+    _write_lines(path, trajectory, (format_tum_line(int(stamp_ns), T) for stamp_ns, T in poses))
 
 
 def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
@@ -251,9 +250,8 @@ def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
     TrajectoryError
         If the file cannot be written.
     """
-    _check_rotations(trajectory)
     rows = trajectory.T_world_frame[:, :3].reshape(-1, 12)
-    _write_lines(path, (" ".join(f"{value:.12e}" for value in row) for row in rows))
+    _write_lines(path, trajectory, (" ".join(f"{value:.12e}" for value in row) for row in rows))
 
 
 def write_euroc(path: str | Path, trajectory: Trajectory) -> None:
@@ -273,22 +271,18 @@ def write_euroc(path: str | Path, trajectory: Trajectory) -> None:
     TrajectoryError
         If the file cannot be written.
     """
-    _check_rotations(trajectory)
     quaternions_xyzw = Rotation.from_matrix(trajectory.T_world_frame[:, :3, :3]).as_quat()
     rows = zip(trajectory.stamps_ns, trajectory.positions, quaternions_xyzw, strict=True)
     lines = (
         ",".join([str(int(stamp_ns)), *(repr(float(x)) for x in (*t, w, *xyz))])
         for stamp_ns, t, (*xyz, w) in rows
     )
-    _write_lines(path, [_EUROC_HEADER, *lines])
+    _write_lines(path, trajectory, [_EUROC_HEADER, *lines])
 
 
-def _check_rotations(trajectory: Trajectory) -> None:
+def _write_lines(path: str | Path, trajectory: Trajectory, lines: Iterable[str]) -> None:
     if not trajectory.has_rotations:
         raise ValueError("a file of poses cannot hold positions without rotations")
-
-
-def _write_lines(path: str | Path, lines: Iterable[str]) -> None:
     with (
         write_faults(TrajectoryError, path),
         Path(path).open("w", encoding="utf-8", newline="\n") as file,

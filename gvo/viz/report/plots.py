@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import cycle
 from typing import Any
 
@@ -71,12 +71,8 @@ TITLES = {
 """Of the plots of a run, by slug, in their order."""
 
 
-def not_drawn(slugs: Iterable[str], reason: str) -> list[Plot]:
-    """Return plots that say why they are not drawn."""
-    return [_not_drawn(slug, reason) for slug in slugs]
-
-
-def _not_drawn(slug: str, reason: str) -> Plot:
+def not_drawn(slug: str, reason: str) -> Plot:
+    """Return a plot that says why it is not drawn."""
     return Plot(slug=slug, title=TITLES[slug], text=f"Not drawn: {reason}.")
 
 
@@ -91,7 +87,7 @@ def pose_plots(truth: Trajectory, evaluations: Sequence[Evaluation], world: Worl
     plots = [_plot("error_path", _error_path(truth, evaluations, world))]
     plots.append(_plot("positions", _values(truth, estimates, POSITIONS)))
     if not all(each.has_rotations for each in (truth, *estimates.values())):
-        return [*plots, *not_drawn(["angles"], "there are positions without rotations")]
+        return [*plots, not_drawn("angles", "there are positions without rotations")]
     # an axis of the world points up, whichever it is
     R_flu_world = _FLU_CAMERA if world.is_up_negative else np.eye(3)
 
@@ -184,7 +180,7 @@ def drift_plot(
             if any(c.errors_rad is None for c in evaluations)
             else f"the path of {path_m:.2g} m is too short for segments"
         )
-        return _not_drawn("drift", reason)
+        return not_drawn("drift", reason)
     origin = f"round lengths for a path of {path_m:.3g} m"
     if lengths == KITTI_SEGMENTS_M:
         origin = "the standard lengths of the KITTI benchmark"
@@ -241,7 +237,7 @@ def _bands(item: Consistency, first_ns: int) -> Figure:
 def status_plot(frames: Table) -> Plot:
     """Return the ribbon of statuses, a row for each that occurs."""
     if len(frames["stamp_ns"]) == 0:
-        return _not_drawn("status", "the run has no frame")
+        return not_drawn("status", "the run has no frame")
     return _plot("status", _ribbon(frames))
 
 
@@ -290,7 +286,7 @@ def count_plot(frames: Table) -> Plot:
     present = {n: frames[f"n_{n}"] for n in palette.COUNTS if f"n_{n}" in frames}
     has_pose = frames["status"] != "skipped"
     if not present or not np.any(has_pose):
-        return _not_drawn("counts", "the run has no counts; its edges were given")
+        return not_drawn("counts", "the run has no counts; its edges were given")
     figure, axes = _time_axes(3.0, "number per frame [-]")
     x = elapsed(frames["stamp_ns"], int(frames["stamp_ns"][0]))
     for name, counts in present.items():
@@ -317,7 +313,7 @@ def timing_plot(timings: Table) -> Plot:
     """Return the milliseconds per frame, stacked by stage."""
     stages_ms = {name: values for name, values in timings.items() if name.endswith("_ms")}
     if not stages_ms or len(timings["stamp_ns"]) == 0:
-        return _not_drawn("timings", "the run has no times of its stages")
+        return not_drawn("timings", "the run has no times of its stages")
     table = np.nan_to_num(np.stack(list(stages_ms.values())))
     total = table.sum(axis=0)
     median, slow = np.quantile(total, [0.5, 0.95])
@@ -347,7 +343,7 @@ def _stack(axes: Axes, timings: Table, table: FloatArray) -> None:
 def edge_plot(edges: Table, first_ns: int) -> Plot:
     """Return the chi-square of the edges over time."""
     if not edges or not np.any(np.isfinite(edges["chi2"])):
-        return _not_drawn("chi2", "the run has no edges with residuals")
+        return not_drawn("chi2", "the run has no edges with residuals")
     bound = chi2_bound(0.95)
     n_refused = int(np.count_nonzero(~edges["is_accepted"]))
     numbers = {"floor": _FLOOR, "n_refused": n_refused, "n_edges": len(edges["chi2"])}

@@ -191,7 +191,8 @@ def _path_plots(lines: list[Line], world: World | None) -> list[Plot]:
 
 def _truth_plots(record: RunRecord, compared: list[Evaluation], reason: str) -> list[Plot]:
     if not compared or record.truth is None:
-        return not_drawn(_TRUTH_PLOTS, f"errors need ground truth, and {reason.removesuffix('.')}")
+        why = f"errors need ground truth, and {reason.removesuffix('.')}"
+        return [not_drawn(slug, why) for slug in _TRUTH_PLOTS]
     return [
         *error_plots(compared, "se3"),
         drift_plot(compared),
@@ -209,7 +210,7 @@ def _covariance_plot(record: RunRecord, truth: Trajectory) -> Plot:
         if not truth.has_rotations
         else "no motion over a second has true poses and a covariance"
     )
-    return not_drawn(["covariance"], reason)[0]
+    return not_drawn("covariance", reason)
 
 
 def _first_ns(record: RunRecord) -> int:
