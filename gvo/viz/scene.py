@@ -36,6 +36,7 @@ NOTHING: Final = RelativePose(T_reference_current=np.eye(4), covariance=np.zeros
 Path: TypeAlias = tuple[IntArray, FloatArray]
 _N_NUMBERS = 7
 _SECOND_NS = 10**9
+_MAX_LOOPS = 1000  # that are drawn
 
 
 class StampedPose(NamedTuple):
@@ -124,7 +125,7 @@ class History:
     window : dict of int to Estimate
         Newest poses of the window by stamp, where they were given.
     loops : list of Loop
-        Those that were confirmed.
+        Those that were confirmed, a thousand at most, the newest ones.
     is_second_new : bool
         Whether a second of the recording began with the newest frame.
     """
@@ -149,7 +150,7 @@ class History:
             self.tracks[name].add(estimate)
         known = {**self.keyframes, result.stamp_ns: result.causal}
         self.keyframes = {ns: known[ns] for ns in result.keyframes_ns if ns in known}
-        self.loops += result.loops
+        self.loops = [*self.loops, *result.loops][-_MAX_LOOPS:]
         self.add_late("smoothed", result.finished)
 
     def add_late(self, name: str, estimates: Iterable[Estimate]) -> None:
@@ -157,9 +158,8 @@ class History:
         for estimate in estimates:
             self.tracks[name].add(estimate)
 
-    def forget(self, n_most: int, n_loops: int) -> None:
-        """Forget the older half of the poses where there are too many, and older loops."""
-        del self.loops[:-n_loops]
+    def forget(self, n_most: int) -> None:
+        """Forget the older half of the poses where there are too many."""
         for track in self.tracks.values():
             if len(track) > n_most:
                 track.forget(n_most // 2)

@@ -59,4 +59,4 @@ def accumulate(clouds: Sequence[tuple[FloatArray, Cloud]]) -> Cloud:
 
 def halve(cloud: Cloud) -> Cloud:
     """Return every second point; of a single one none."""
-    return cloud[0][1::2], cloud[1][1::2]
+    return cloud[0][1::2].copy(), cloud[1][1::2].copy()

@@ -23,7 +23,8 @@ from gvo.viz.view.clouds import MAX_POINTS, NO_CLOUD, Cloud, accumulate, frame_c
 # Newest poses of the window that are drawn; the window may hold all.
 _N_POSES = 24
 _N_SHOWN_POSES = 1000  # of a path, at most
-_MAX_KEPT_POSES, _MAX_KEPT_LOOPS = 300_000, 1000  # some hours
+_MAX_KEPT_POSES = 300_000  # some hours
+_MAX_CLOUDS = 500  # of keyframes: each takes a tenth of a millisecond whenever all are drawn
 _MAX_WIDTH_PX = 480
 
 
@@ -140,10 +141,12 @@ class Newest:
         if result.stamp_ns in result.keyframes_ns:
             cloud = frame_cloud(frame, matched_points(result), self._camera, depth)
             self._clouds[result.stamp_ns] = cloud
+            if len(self._clouds) > _MAX_CLOUDS:
+                self._clouds = dict([*self._clouds.items()][::2])
             if sum(len(points) for points, _ in self._clouds.values()) > MAX_POINTS:
                 halves = {ns: halve(each) for ns, each in self._clouds.items()}
                 self._clouds = {ns: each for ns, each in halves.items() if len(each[0])}
-        self.history.forget(_MAX_KEPT_POSES, _MAX_KEPT_LOOPS)
+        self.history.forget(_MAX_KEPT_POSES)
 
     def finish(self, estimates: Iterable[Estimate]) -> None:
         """Take the smoothed poses that are known at the end."""

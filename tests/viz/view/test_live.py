@@ -120,7 +120,7 @@ def test_what_a_page_keeps_of_a_long_run_is_bounded(
 ) -> None:
     monkeypatch.setattr("gvo.viz.view.newest.MAX_POINTS", 500)
     monkeypatch.setattr("gvo.viz.view.newest._MAX_KEPT_POSES", 40)
-    monkeypatch.setattr("gvo.viz.view.newest._MAX_KEPT_LOOPS", 3)
+    monkeypatch.setattr("gvo.viz.scene._MAX_LOOPS", 3)
     for index in range(50):
         loops = (loop_of(PERIOD_NS * index, 0),)
         add(player, window, index, keyframes_ns=(PERIOD_NS * index,), loops=loops)
@@ -130,6 +130,18 @@ def test_what_a_page_keeps_of_a_long_run_is_bounded(
     assert len(history.loops) == 3
     assert [len(history.tracks[name]) for name in ("raw", "causal", "smoothed")] == [30] * 3
     assert history.tracks["raw"].path()[0][-1] == 49 * PERIOD_NS
+
+
+def test_a_page_draws_the_clouds_of_a_bounded_number_of_keyframes(
+    player: LivePlayer, window: FakeWindow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gvo.viz.view.newest._MAX_CLOUDS", 8)
+    n_points = []
+    for index in range(30):
+        add(player, window, index, keyframes_ns=(PERIOD_NS * index,))
+        n_points.append(len(player.newest.keyframe_cloud()[0]))
+    assert max(n_points) == 8 * n_points[0]
+    assert n_points[-1] >= 4 * n_points[0] > 0
 
 
 def test_loops_go_on_being_drawn_where_poses_are_corrected(
