@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from functools import partial
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ from gvo.config import Config
 from gvo.diagnostics.check.findings import Finding
 from gvo.diagnostics.check.limits import MAX_BLUR_PX, lost, measured, unknown
 from gvo.diagnostics.check.sampling import Sample
-from gvo.frontend.tracking import N_WIDE_LEVELS, detect_corners, track_pixels
+from gvo.frontend.tracking import detect_corners
 from gvo.types import (
     DepthArray,
     FaultyFrame,
@@ -31,6 +32,10 @@ _MIN_GRADIENT = 8.0
 _MIN_EDGES = 20
 # Share of the local maxima of the gradient that are taken for edges of things.
 _STRONG_SHARE = 0.3
+# Of corners that are found again: a window that hardly slides along an edge.
+_WINDOW = (15, 15)
+_N_TRACK_LEVELS = 4
+_MAX_RETURN_PX = 0.5
 # Share and number of last rows of one value that make an image torn.
 _MIN_TORN_SHARE = 0.05
 _MIN_TORN_ROWS = 4
@@ -158,9 +163,15 @@ def _check_texture(
 
 def _followed_share(images: tuple[ImageArray, ImageArray], n_corners: int) -> float:
     """Return the share of corners that Lucas-Kanade tracks to the next image and back."""
-    start = detect_corners(images[0], n_corners)
-    _, is_found = track_pixels(images, start, start, n_levels=N_WIDE_LEVELS, is_checked=True)
-    return float(np.mean(is_found)) if len(start) else 0.0
+    start = detect_corners(images[0], n_corners).astype(np.float32)
+    if len(start) == 0:
+        return 0.0
+    track = partial(cv2.calcOpticalFlowPyrLK, winSize=_WINDOW, maxLevel=_N_TRACK_LEVELS)
+    there, is_there, _ = track(*images, start, start.copy())
+    back, is_back, _ = track(*images[::-1], there, start.copy())
+    is_found = (is_there[:, 0] > 0) & (is_back[:, 0] > 0)
+    is_found &= np.linalg.norm(back - start, axis=1) <= _MAX_RETURN_PX
+    return float(np.mean(is_found))
 
 
 def _check_torn(name: str, images: Sequence[ImageArray]) -> Finding:
