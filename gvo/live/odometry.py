@@ -234,6 +234,7 @@ class LiveOdometry:
             is_robot=not base_frame.is_camera and not base_frame.origin,
         )
         self._loop, self._save = loop, save
+        loop.reconfigure(self.parameters.config)  # it may have changed since the run was begun
         waiting = self._waiting
         loop.waited_s = lambda: waiting.waited_s
         if self.viewer is not None:
