@@ -62,7 +62,7 @@ def has(*names: str) -> Callable[[], bool]:
     def is_there(name: str) -> bool:
         if "/" in name:
             return (ROOT / name).exists()
-        return name in COMMANDS or name in gvo.__all__
+        return name in COMMANDS or name in dir(gvo)
 
     return lambda: all(map(is_there, names))
 
