@@ -19,10 +19,12 @@ from gvo.types import IntArray
 if TYPE_CHECKING:
     from rosbags.typesys.stores.ros2_humble import sensor_msgs__msg__Image as RawImage
 
-MAX_RVL_PIXELS = 1 << 21
-"""More than depth cameras have; to decode a pixel takes a hundred times its memory."""
+MAX_RVL_PIXELS = 1 << 24
+"""More than any depth camera has; to decode a pixel takes a hundred times its memory."""
 _SIZE = struct.Struct("<II")
-_MAX_BYTES_PER_PIXEL = 3  # six nibbles of a value that is far from the one before
+_MAX_NUMBERS_PER_PIXEL = 3  # a run of one value, behind none: two lengths and the value
+_MAX_NIBBLES = 64  # of a number; three make a depth
+_BLOCK_WORDS = 1 << 18
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +171,7 @@ def decode_rvl(data: NDArray[np.uint8], where: str) -> NDArray[np.uint16]:
         raise RecordingError(f"{where}: the RVL image has no size")
     width, height = _SIZE.unpack(data[: _SIZE.size].tobytes())
     check_size(width, height, where, max_pixels=MAX_RVL_PIXELS)
-    numbers = _numbers(data[_SIZE.size :][: _MAX_BYTES_PER_PIXEL * (width * height + 1)])
+    numbers = _numbers(data[_SIZE.size :], _MAX_NUMBERS_PER_PIXEL * width * height)
     firsts, starts, lengths = _runs(numbers, width * height, where)
     is_known = np.repeat(np.arange(len(lengths)), lengths)
     steps = np.arange(len(is_known)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
@@ -180,19 +182,35 @@ def decode_rvl(data: NDArray[np.uint8], where: str) -> NDArray[np.uint16]:
     return counts.reshape(height, width)
 
 
-def _numbers(code: NDArray[np.uint8]) -> IntArray:
-    """Return the numbers of the code; one cut off by the end is left out."""
+def _numbers(code: NDArray[np.uint8], n_max: int) -> IntArray:
+    """Return the numbers of the code, no more than are needed; one cut off by the end is left out.
+
+    Block by block: all at once would take a hundred times the memory of the code.
+    """
     words = np.frombuffer(code[: len(code) // 4 * 4].tobytes(), dtype="<u4")
-    shifted = words[:, np.newaxis] >> np.arange(28, -1, -4, dtype=np.uint32)
-    nibbles = shifted.astype(np.uint8).ravel() & 15
+    rest = np.zeros(0, dtype=np.uint8)
+    blocks: list[IntArray] = [np.zeros(0, dtype=np.int64)]
+    n_found, start = 0, 0
+    while start < len(words) and n_found < n_max and len(rest) <= _MAX_NIBBLES:
+        block = words[start : start + _BLOCK_WORDS, np.newaxis]
+        nibbles = (block >> np.arange(28, -1, -4, dtype=np.uint32)) & 15
+        numbers, rest = _numbers_of(np.concatenate([rest, nibbles.astype(np.uint8).ravel()]))
+        blocks.append(numbers)
+        n_found += len(numbers)
+        start += _BLOCK_WORDS
+    return np.concatenate(blocks)
+
+
+def _numbers_of(nibbles: NDArray[np.uint8]) -> tuple[IntArray, NDArray[np.uint8]]:
+    """Return the numbers of nibbles, and the nibbles of the one that goes on."""
     ends = np.flatnonzero(nibbles < 8)
     if len(ends) == 0:
-        return np.zeros(0, dtype=np.int64)
-    whole = nibbles[: ends[-1] + 1]
-    begins = np.concatenate([[0], ends[:-1] + 1]).astype(np.int32)
-    places = np.arange(len(whole), dtype=np.int32) - np.repeat(begins, ends + 1 - begins)
+        return np.zeros(0, dtype=np.int64), nibbles
+    whole, rest = np.split(nibbles, [ends[-1] + 1])
+    begins = np.concatenate([[0], ends[:-1] + 1])
+    places = np.arange(len(whole)) - np.repeat(begins, ends + 1 - begins)
     bits = (whole & 7).astype(np.int64) << np.minimum(3 * places, 60)
-    return np.asarray(np.add.reduceat(bits, begins), dtype=np.int64)
+    return np.asarray(np.add.reduceat(bits, begins), dtype=np.int64), rest
 
 
 def _runs(numbers: IntArray, n_pixels: int, where: str) -> tuple[IntArray, IntArray, IntArray]:
