@@ -26,6 +26,7 @@ _MAX_NAME = 150
 # Depth of the search: a link to a parent folder must end somewhere.
 _MAX_DEPTH = 12
 _COMPRESSED = ".zstd"
+_COMMENT = re.compile(r"(^|\s)#.*")
 # The batch's own files, also while they are written.
 _TAKEN = {f"{name}{end}" for name in (CSV, REPORT, MARK) for end in ("", ".new")}
 DEFAULT = "default"
@@ -41,8 +42,8 @@ def find_recordings(asked: Sequence[str | Path]) -> dict[str, str]:
     ----------
     asked : sequence of str or Path
         Each a path of a recording, a folder, which is searched unless it is a recording itself, or
-        a `.txt` file with one of these a line, relative to its folder. A path that does not exist
-        is taken for a recording that only the workers see.
+        a `.txt` file with one of these a line, relative to its folder, with comments after `#`. A
+        path that does not exist is taken for a recording that only the workers see.
 
     Returns
     -------
@@ -60,21 +61,27 @@ def find_recordings(asked: Sequence[str | Path]) -> dict[str, str]:
         raise ValueError("expected at least one recording")
     locations: dict[str, None] = {}
     for one in asked:
-        # Links are not resolved: on a worker they may lead elsewhere.
-        places = [Path(os.path.abspath(each)) for each in _paths(Path(one).expanduser())]  # noqa: PTH100
-        found = [str(each) for place in places for each in _search_below(place)]
+        found: dict[str, None] = {}
+        for where, path in _places(Path(one).expanduser()):
+            # Links are not resolved: on a worker they may lead elsewhere.
+            here = dict.fromkeys(map(str, _search_below(Path(os.path.abspath(path)))))  # noqa: PTH100
+            if not here:
+                raise RecordingError(f"{where}: no recording there")
+            found |= here
         if not found:
             raise RecordingError(f"{one}: no recording there")
-        locations.update(dict.fromkeys(found))
+        locations |= found
     return _name(list(locations))
 
 
-def _paths(path: Path) -> list[Path]:
-    """Return the paths in a list, or the path itself."""
+def _places(path: Path) -> Iterator[tuple[str, Path]]:
+    """Yield a path, or those in a list, each with where it was asked for."""
     if path.suffix != ".txt" or not path.is_file():
-        return [path]
-    lines = (line.strip() for _, line in text_lines(path, RecordingError, max_lines=_MAX_LISTED))
-    return [path.parent / line for line in lines if line and not line.startswith("#")]
+        yield str(path), path
+        return
+    for number, line in text_lines(path, RecordingError, max_lines=_MAX_LISTED):
+        if entry := _COMMENT.sub("", line).strip():
+            yield f"{path}, line {number}: {entry}", path.parent / entry
 
 
 def _search_below(place: Path, depth: int = 0) -> Iterator[Path]:

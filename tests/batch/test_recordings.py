@@ -53,7 +53,7 @@ def test_the_files_of_a_bag_folder_are_no_recordings_of_their_own(tmp_path: Path
 def test_a_list_has_one_recording_a_line(tmp_path: Path) -> None:
     make_files(tmp_path, "in/a.bag", "in/b#1.bag", "more/c.bag", "more/d.mcap")
     (tmp_path / "in" / "list.txt").write_bytes(
-        b"\xef\xbb\xbf# recordings\r\na.bag\r\n\r\n  b#1.bag\n../more\n/not/here.bag"
+        b"\xef\xbb\xbf# recordings\r\na.bag\r\n\r\n  b#1.bag   # a comment\n../more\n/not/here.bag"
     )
     found = find_recordings([tmp_path / "in" / "list.txt"]).values()
     places = ["in/a.bag", "in/b#1.bag", "more/c.bag", "more/d.mcap"]
@@ -61,6 +61,16 @@ def test_a_list_has_one_recording_a_line(tmp_path: Path) -> None:
     (tmp_path / "list.txt").write_bytes(b"\xff\xfe")
     with pytest.raises(RecordingError, match=r"list\.txt: is no text file"):
         find_recordings([tmp_path / "list.txt"])
+
+
+def test_what_of_a_list_leads_to_no_recording_is_named_with_its_line(tmp_path: Path) -> None:
+    make_files(tmp_path, "a.bag", "empty/readme.md")
+    (tmp_path / "list.txt").write_text("a.bag\nempty\n")
+    with pytest.raises(RecordingError, match=r"list\.txt, line 2: empty: no recording there"):
+        find_recordings([tmp_path / "list.txt"])
+    (tmp_path / "none.txt").write_text("# none\n")
+    with pytest.raises(RecordingError, match=r"none\.txt: no recording there"):
+        find_recordings([tmp_path / "none.txt"])
 
 
 def test_an_empty_folder_is_an_error(tmp_path: Path) -> None:
