@@ -154,7 +154,7 @@ class StereoConfig(Section):
     subpixel: Literal["parabola", "none"] = _expert(
         "parabola", "disparity by a parabola through patch differences, or from the keypoints"
     )
-    estimate_offset: bool = _expert(True, "estimate the constant disparity error of the rig online")
+    estimate_offset: bool = _expert(True, "learn online what the calibration of the rig leaves")
 
 
 class TemporalConfig(Section):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
 from numbers import Integral
 from typing import Any, Literal, Protocol, TypeAlias, get_args
@@ -262,34 +262,6 @@ class MotionPrior:
             _freeze(self, T_recent=(4, 4))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ConstantError:
-    """What a registration tells of the error of a constant of the camera.
-
-    Parameters
-    ----------
-    value, sigma : float
-        By how much the constant seems too large, and the standard deviation of this estimate.
-    effect : ndarray of float64, shape (6,)
-        By how much an error of one unit moves the registered pose (rx, ry, rz, tx, ty, tz), in
-        the current camera frame.
-    """
-
-    value: float
-    sigma: float
-    effect: FloatArray
-
-    def times(self, factor: float) -> ConstantError:
-        """Return it in another unit."""
-        return ConstantError(
-            value=factor * self.value, sigma=factor * self.sigma, effect=self.effect / factor
-        )
-
-    def widened(self, factor: float) -> ConstantError:
-        """Return it with a larger sigma."""
-        return replace(self, sigma=factor * self.sigma)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RelativePose:
     """A registration's result.
@@ -315,9 +287,9 @@ class RelativePose:
         exposure, metres. Likewise.
     flow_px : float or None
         Median displacement of the inliers between the images, where the front-end tells.
-    calibration_errors : mapping of str to ConstantError
-        What the matches tell of errors of the camera's constants, by name; without those that
-        were not asked for or are not observable.
+    effects : mapping of str to ndarray of float64, shape (6,)
+        By how much the pose is moved, in the current camera frame, by a sigma of each constant of
+        the camera that is in doubt, by name.
     """
 
     T_reference_current: FloatArray
@@ -329,7 +301,7 @@ class RelativePose:
     pixels_current: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     points_current: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     flow_px: float | None = None
-    calibration_errors: Mapping[str, ConstantError] = field(default_factory=dict)
+    effects: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @property
     def n_matches(self) -> int:

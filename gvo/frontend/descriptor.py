@@ -69,7 +69,7 @@ class DescriptorFrontend:
     ) -> None:
         self.camera = as_stereo(camera)
         is_stereo = isinstance(camera, StereoCamera)
-        self.rig_offsets = rig_offsets or RigOffsets(config, is_stereo=is_stereo)
+        self.rig_offsets = rig_offsets or RigOffsets(self.camera, config, is_stereo=is_stereo)
         self.calibrated = CalibratedCamera(self.camera, self.rig_offsets)
         self._config = config
         self._extractors = [FeatureExtractor(config.features) for _ in range(2)]
@@ -93,7 +93,8 @@ class DescriptorFrontend:
         pairs = match_stereo(left, right, self.camera, config)
         pixels = left.keypoints[pairs[:, 0]], right.keypoints[pairs[:, 1]]
         disparities, is_valid = refine_disparities((frame.left, frame.right), *pixels, config)
-        is_in_range = is_in_depth_range(disparities - self._offset_px(), self.camera, config)
+        ideal = self.rig_offsets.take_off(np.column_stack([pixels[0], disparities]))
+        is_in_range = is_in_depth_range(ideal[:, 2], self.camera, config)
         is_valid &= is_in_range
         return self._observe(frame.stamp_ns, left, right, pairs[is_valid], disparities[is_valid])
 
@@ -121,11 +122,12 @@ class DescriptorFrontend:
         disparities: FloatArray,
     ) -> DescriptorObservations:
         keypoints = left.keypoints[pairs[:, 0]]
+        ideal = self.rig_offsets.take_off(np.column_stack([keypoints, disparities]))
         return DescriptorObservations(
             stamp_ns=stamp_ns,
             keypoints=keypoints,
             disparities=disparities,
-            points_cam=self.camera.unproject_stereo(keypoints, disparities - self._offset_px()),
+            points_cam=self.camera.unproject_stereo(ideal[:, :2], ideal[:, 2]),
             sigmas=self._sigmas(left.octaves[pairs[:, 0]], is_stereo=right is not None),
             descriptors_left=left.descriptors[pairs[:, 0]],
             descriptors_right=None if right is None else right.descriptors[pairs[:, 1]],
@@ -206,7 +208,7 @@ class DescriptorFrontend:
         rough = register_anywhere(
             *(reference, observations, match_anywhere([first], [second])),
             *(self.camera, self._config),
-            offset_px=self._offset_px(),
+            offsets=self.rig_offsets,
         )
         if isinstance(rough, Failure):
             return rough
@@ -222,9 +224,6 @@ class DescriptorFrontend:
         prior = MotionPrior(T_predicted=rough.T_reference_current)
         result = self._register_within(reference, current, prior, is_wide=False)
         return check_view(result, reference.points_cam, self.camera)
-
-    def _offset_px(self) -> float:
-        return self.rig_offsets.disparity_px
 
     def _register_within(
         self,

@@ -93,7 +93,7 @@ class KltFrontend:
     ) -> None:
         self.camera = as_stereo(camera)
         self._is_stereo = isinstance(camera, StereoCamera)
-        self.rig_offsets = rig_offsets or RigOffsets(config, is_stereo=self._is_stereo)
+        self.rig_offsets = rig_offsets or RigOffsets(self.camera, config, is_stereo=self._is_stereo)
         self.calibrated = CalibratedCamera(self.camera, self.rig_offsets)
         self._config = config
 
@@ -121,30 +121,30 @@ class KltFrontend:
     def _find_corners(
         self, frame: Frame, half: ImageArray, n_corners: int, *, spacing_px: int = SPACING_PX
     ) -> KltCorners:
-        offset_px, row_offset_px = self.rig_offsets.disparity_px, self.rig_offsets.row.value
         corners = detect_corners(image_of(frame), n_corners, spacing_px=spacing_px, half=half)
-        row_px = None
+        row_shifts_px = np.full(len(corners), np.nan)
         if isinstance(frame, StereoFrame):
             config, images = self._config.stereo, (frame.left, frame.right)
             limit = float(self.camera.depth_to_disparity(config.min_depth_m))
             halves = half, halve(frame.right)
+            row_offsets_px = self.rig_offsets.row_errors(corners)
             measured = measure_corners(
-                images, halves, corners, config, max_disparity=limit, row_offset_px=row_offset_px
+                images, halves, corners, config, max_disparity=limit, row_offsets_px=row_offsets_px
             )
             disparities, slopes = measured.disparities, measured.slopes
-            if measured.row_shift_px is not None:
-                row_px = measured.row_shift_px + row_offset_px
-            is_valid = measured.are_reliable & self._is_in_range(disparities, offset_px)
+            row_shifts_px = measured.row_shifts_px + row_offsets_px
+            is_valid = measured.are_reliable & self._is_in_range(corners, disparities)
         else:
             disparities, is_valid = self._measure_depth(frame, corners)
             slopes = np.zeros_like(corners)
         uvd = np.column_stack([corners, disparities])[is_valid]
+        ideal = self.rig_offsets.take_off(uvd)
         return KltCorners(
             uvd=uvd,
             slopes=slopes[is_valid],
-            points_cam=self.camera.unproject_stereo(uvd[:, :2], uvd[:, 2] - offset_px),
+            points_cam=self.camera.unproject_stereo(ideal[:, :2], ideal[:, 2]),
             n_keypoints=len(corners),
-            row_px=row_px,
+            row_shifts_px=row_shifts_px[is_valid],
             templates=Templates.of(image_of(frame), uvd[:, :2]),
         )
 
@@ -174,7 +174,8 @@ class KltFrontend:
             is_step = prior is None or prior.T_recent is not None
             self.calibrated.accept(result, self._config, is_step=is_step)
             if is_step:
-                self.rig_offsets.note_rows(reference.corners.row_px)
+                corners = reference.corners
+                self.rig_offsets.note_rows(corners.uvd, corners.row_shifts_px)
         return result
 
     def _register(
@@ -288,10 +289,8 @@ class KltFrontend:
         """Register by descriptors, which match corners that moved too far for a track."""
         first, second = (self._as_observations(place) for place in (reference, current))
         matches = match_anywhere(reference.descriptors, current.descriptors)
-        offset_px = self.rig_offsets.disparity_px
-        return register_anywhere(
-            first, second, matches, self.camera, self._config, offset_px=offset_px
-        )
+        offsets = self.rig_offsets
+        return register_anywhere(first, second, matches, self.camera, self._config, offsets=offsets)
 
     def _as_observations(self, place: KltPlace) -> Observations:
         sigmas = np.ones((len(place.uvd), 3)) * [1.0, 1.0, self._sigmas(1)[0][0, 2]]
@@ -451,16 +450,17 @@ class KltFrontend:
         if isinstance(frame, RgbdFrame):
             return self._measure_depth(frame, pixels)
         config, images = self._config.stereo, (frame.left, frame.right)
-        offset_px, row_offset_px = self.rig_offsets.disparity_px, self.rig_offsets.row.value
+        row_offsets_px = self.rig_offsets.row_errors(pixels)
         follow = partial(follow_disparities, n_steps=_N_TRACK_STEPS, slopes=expected.slopes)
         measure = measure_disparities if search == "wide" else follow
         disparities, is_valid = measure(
-            images, pixels, expected.uvd[:, 2], config, row_offset_px=row_offset_px
+            images, pixels, expected.uvd[:, 2], config, row_offsets_px=row_offsets_px
         )
-        return disparities, is_valid & self._is_in_range(disparities, offset_px)
+        return disparities, is_valid & self._is_in_range(pixels, disparities)
 
-    def _is_in_range(self, disparities: FloatArray, offset_px: float) -> BoolArray:
-        return is_in_depth_range(disparities - offset_px, self.camera, self._config.stereo)
+    def _is_in_range(self, pixels: FloatArray, disparities: FloatArray) -> BoolArray:
+        ideal = self.rig_offsets.take_off(np.column_stack([pixels, disparities]))
+        return is_in_depth_range(ideal[:, 2], self.camera, self._config.stereo)
 
     def _measure_depth(self, frame: RgbdFrame, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
         depths, is_valid = sample_depth(frame.depth, pixels, self._config.depth)
@@ -479,13 +479,13 @@ class KltCorners:
     slopes : ndarray of float64, shape (n, 2)
         Change of the disparity per pixel, along rows and columns; zero for RGB-D.
     points_cam : ndarray of float64, shape (n, 3)
-        Points in the `cam` frame, metres, the disparities corrected by the offset known then.
+        Points in the `cam` frame, metres, without the errors of the lens known then.
     templates : Templates
         The patches around them.
     n_keypoints : int
         Corners detected, measured or not.
-    row_px : float or None
-        Row offset of the right image; None where not measured.
+    row_shifts_px : ndarray of float64, shape (n,)
+        By how much their rows are larger in the right image; NaN where not measured.
     """
 
     uvd: FloatArray
@@ -493,7 +493,7 @@ class KltCorners:
     points_cam: FloatArray
     templates: Templates
     n_keypoints: int
-    row_px: float | None = None
+    row_shifts_px: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -647,6 +647,7 @@ class KltPlace:
             points_cam=self.points_cam,
             templates=Templates.of_patches(self.patches),
             n_keypoints=len(self.uvd),
+            row_shifts_px=np.full(len(self.uvd), np.nan),
         )
         return KltReference(stamp_ns=self.stamp_ns, corners=corners, motion=self.motion)
 

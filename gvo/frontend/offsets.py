@@ -1,37 +1,50 @@
-"""What is learnt of constants of the camera: disparity and row offsets, and readout time."""
+"""What is learnt of constants of a camera while it runs: its lens, its rows, its readout time."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from gvo.config import Config
-from gvo.types import ConstantError, RelativePose
+from gvo.geometry.camera import StereoCamera
+from gvo.geometry.refinement import Constants
+from gvo.kernels import lens as kernels
+from gvo.types import FloatArray
 
 # Largest inflation of the sigmas of a registration by tracks: errors of near ones correlate.
 KLT_SIGMA_FACTOR = 2.4
-# Prior standard deviation of the constant error of disparities.
-OFFSET_SIGMA_PX = 0.1
-# Names of what registrations tell.
-DISPARITY, READOUT = "disparity_px", "readout_s"
-# Errors of registrations are correlated (the same walls, the same lens): their sigmas are too small
-# by these factors.
-_DISPARITY_FACTOR = 3.0
-_READOUT_FACTOR = 5.0
-# An offset of the disparities that is not taken off, as registrations do not tell it from errors
-# that all of them share.
-_FEIGNED_PX = 0.05
-# Sigmas of the row offset measured in one frame, and of its prior, pixels.
-_ROW_SIGMA_PX = 0.1
-_ROW_PRIOR_PX = 0.3
-# Sigma of the prior of the readout time, seconds: rolling shutters take 5 to 33 ms. Below the lower
-# one a readout that may be zero is taken for zero.
-_READOUT_PRIOR_S = 0.03
+LENS = "d0", "dx", "dy", "dxx", "dxy", "dyy", "tx", "ty", "k1", "p1", "p2"
+"""Constants of pixels and disparities, see `gvo.kernels.lens`."""
+ROWS = "r0", "rx", "ry", "rxx", "rxy", "ryy"
+"""Constants of the rows of the right image."""
+READOUT = "readout_s"
+# By how many pixels what is seen anywhere in the image may be off: sigmas for each constant of the
+# disparities, of the lens, and of the rows.
+_DISPARITY_PRIOR_PX = 0.5
+_LENS_PRIOR_PX = 1.5
+_ROW_PRIOR_PX = 1.0
+# Mean and sigma of the readout time of RGB-D cameras, whose shutters roll, and of stereo cameras,
+# whose shutters hardly do, seconds.
+_READOUT_RGBD_S = 0.02, 0.01
+_READOUT_STEREO_S = 0.0, 0.01
+# A readout that may be longer than this, in seconds, is reckoned with.
 _LEAST_READOUT_S = 0.005
-# Drift per frame: temperature, vibration.
-_DRIFT_PX = 5e-4
-_DRIFT_S = 1e-5
-# Innovations are clipped to so many sigmas.
-_MAX_SURPRISE = 3.0
+# Errors of registrations are correlated (the same walls, the same lens): their sigmas are too small
+# by this factor.
+_FACTOR = 3.0
+# What is not significant, in sigmas, is not taken off; nor errors, in pixels, root mean square over
+# the image, that registrations do not tell from errors which all of them share.
+_GATE = 4.0
+_FEIGNED_PX = 0.05
+# Frames over which what was learnt is forgotten: temperature, vibration.
+_N_LASTING = 3000
+# Sigma of the row of one corner, and beyond which it tells less, pixels; steps of that.
+_ROW_SIGMA_PX = 0.5
+_ROW_KERNEL_PX = 0.15
+_N_ROW_STEPS = 3
+# Corners whose rows are looked at in a frame, at least and at most.
+_MIN_ROWS, _MAX_ROWS = 50, 120
 # Misfits that a variance factor is averaged over; the largest, per degree of freedom; and the share
 # of the variance that errors are taken to have which registrations of the same motion share.
 _N_MISFITS = 30
@@ -40,37 +53,44 @@ _SHARED = 0.25
 
 
 class ConstantFilter:
-    """A scalar Kalman filter of a value that hardly changes.
+    """An information filter of constants, all of them together.
 
     Parameters
     ----------
-    prior_sigma : float
-        Standard deviation of the prior, in the unit of the value; 0: it is known.
-    drift : float
-        Standard deviation of its change per frame.
-    value : float
-        Mean of the prior.
+    mean, sigmas : ndarray of float64, shape (k,)
+        Of the prior.
 
     Attributes
     ----------
-    value, sigma : float
-        The present estimate, and its standard deviation.
+    mean : ndarray of float64, shape (k,)
+        What was learnt.
+    covariance, information : ndarray of float64, shape (k, k)
+        Of that.
     """
 
-    def __init__(self, prior_sigma: float, drift: float, value: float = 0.0) -> None:
-        self._prior_sigma, self._drift = prior_sigma, drift
-        self.value, self.sigma = value, prior_sigma
+    def __init__(self, mean: FloatArray, sigmas: FloatArray) -> None:
+        self.mean, self.covariance = mean, np.diag(sigmas**2)
+        self.information = self._prior = np.diag(sigmas**-2)
+        self._prior_vector = self._prior @ mean
+        self._told, self._vector = np.zeros_like(self._prior), np.zeros_like(mean)
+
+    def note(self, information: FloatArray, score: FloatArray, used: FloatArray) -> None:
+        """Take normal equations of what is left of the constants, after some were used."""
+        self._told += information / _FACTOR**2
+        self._vector += (information @ used + score) / _FACTOR**2
 
     def advance(self) -> None:
-        """Let the value drift for a frame."""
-        self.sigma = min(math.hypot(self.sigma, self._drift), self._prior_sigma)
+        """Solve for all that was noted, and forget a little of it."""
+        self.information = self._prior + self._told
+        self.covariance = np.asarray(np.linalg.inv(self.information))
+        self.mean = np.asarray(self.covariance @ (self._prior_vector + self._vector))
+        self._told *= 1.0 - 1.0 / _N_LASTING
+        self._vector *= 1.0 - 1.0 / _N_LASTING
 
-    def update(self, error: float, sigma: float) -> None:
-        """Add a measurement of what is left of the value, and its standard deviation."""
-        limit = _MAX_SURPRISE * math.hypot(self.sigma, sigma)
-        gain = self.sigma**2 / (self.sigma**2 + sigma**2)
-        self.value += gain * min(max(error, -limit), limit)
-        self.sigma *= math.sqrt(1.0 - gain)
+    def significance(self, chosen: slice) -> float:
+        """Return how far some constants are from zero, in sigmas."""
+        mean, covariance = self.mean[chosen], self.covariance[chosen, chosen]
+        return math.sqrt(mean @ np.linalg.solve(covariance, mean))
 
 
 class VarianceFactor:
@@ -114,33 +134,32 @@ class VarianceFactor:
 
 
 class RigOffsets:
-    """What is learnt of a camera while it runs: disparity and row offsets, readout time.
+    """What is learnt of a camera while it runs: its lens, its rows, its readout time.
 
     Measurements take effect with `advance`, so that all registrations of one frame use the same
     values.
 
     Parameters
     ----------
+    camera : StereoCamera
     config : Config
-        `stereo.estimate_offset`, else the offsets stay at zero; `camera.readout_ms`, known or to
-        be learnt.
+        `stereo.estimate_offset`, else lens and rows stay as they are; `camera.readout_ms`, known or
+        to be learnt.
     is_stereo : bool
-        Other sensors have no offsets.
+        Of other sensors, whose depth is not that of their lens, the readout time alone is learnt.
 
     Attributes
     ----------
-    disparity, row : ConstantFilter
-        By how much disparities and rows of the right image are too large, pixels.
-    readout : ConstantFilter
-        Time from the first to the last row, seconds.
-    learnt : dict of str to ConstantFilter
-        Those of them that registrations tell, by name.
-    disparity_px : float
-        The offset that is taken off disparities, pixels: what was learnt beyond a twentieth of a
-        pixel. So much is feigned by lenses and by patches that hold more than one surface.
+    lens : ndarray of float64, shape (11,)
+        The constants `LENS` that are taken off pixels and disparities: what was learnt beyond a
+        twentieth of a pixel. So much is feigned by patches that hold more than one surface.
+    rows : ndarray of float64, shape (6,)
+        The constants `ROWS` that are taken off rows of the right image.
     readout_s : float
         The readout time that is reckoned with, seconds: zero where it may be zero. A global
         shutter is not to be bent by what is left of the noise.
+    readout : tuple of two float
+        The readout time as learnt or given, seconds, and its standard deviation.
     possible_readout_s : float
         How long the readout may be, seconds: zero where it is known to take no time.
     chain_factor, window_factor : VarianceFactor
@@ -148,41 +167,67 @@ class RigOffsets:
         by loops of links and steps, and by the edges of one frame in the window.
     """
 
-    def __init__(self, config: Config, *, is_stereo: bool = True) -> None:
-        readout_ms = config.camera.readout_ms
-        self.disparity = ConstantFilter(OFFSET_SIGMA_PX, _DRIFT_PX)
-        self.row = ConstantFilter(_ROW_PRIOR_PX, _DRIFT_PX)
-        self.readout = (
-            ConstantFilter(_READOUT_PRIOR_S, _DRIFT_S)
-            if readout_ms is None
-            else ConstantFilter(0.0, 0.0, 1e-3 * readout_ms)
-        )
-        self.learnt = {
-            name: constant
-            for name, constant, is_learnt in (
-                (DISPARITY, self.disparity, is_stereo and config.stereo.estimate_offset),
-                (READOUT, self.readout, readout_ms is None),
-            )
-            if is_learnt
-        }
+    def __init__(self, camera: StereoCamera, config: Config, *, is_stereo: bool = True) -> None:
+        self._is_stereo = is_stereo
+        self._learns_lens = is_stereo and config.stereo.estimate_offset
+        u, v = np.meshgrid(np.linspace(0, camera.width, 17), np.linspace(0, camera.height, 9))
+        self._places = np.column_stack([u.ravel(), v.ravel(), np.zeros(u.size)])
+        self._camera = camera
+        self._grid = self.lens_fields(self._places)
+        self._readout_ms = config.camera.readout_ms
+        self.lens, self.rows = np.zeros(len(LENS)), np.zeros(len(ROWS))
+        self.readout = (1e-3 * (self._readout_ms or 0.0), 0.0)
+        mean, sigmas, row_sigmas = [], [], np.ones(len(ROWS))
+        if self._learns_lens:
+            reach = np.linalg.norm(self._grid, axis=2).max(axis=1)
+            prior_px = [_DISPARITY_PRIOR_PX if name[0] == "d" else _LENS_PRIOR_PX for name in LENS]
+            mean, sigmas = [0.0] * len(LENS), [*(prior_px / reach)]
+            row_sigmas = _ROW_PRIOR_PX / np.abs(self._row_fields(self._places)).max(axis=1)
+        if self._readout_ms is None:
+            known, sigma = _READOUT_STEREO_S if self._is_stereo else _READOUT_RGBD_S
+            mean, sigmas = [*mean, known], [*sigmas, sigma]
+        self._constants = ConstantFilter(np.array(mean), np.array(sigmas))
+        self._rows = ConstantFilter(np.zeros(len(ROWS)), row_sigmas)
         self._sigma_factor = math.nan
         self.reconfigure(config)
-        self._is_stereo = is_stereo
-        self._disparity_error: ConstantError | None = None
-        self._readout_errors: list[ConstantError] = []
-        self._row_px: float | None = None
         self._settle()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The constants that registrations tell, in this order."""
+        lens = LENS if self._learns_lens else ()
+        return lens if self._readout_ms is not None else (*lens, READOUT)
+
+    @property
+    def learnt(self) -> dict[str, tuple[float, float]]:
+        """What was learnt by name, rows of the right image besides, and its standard deviation."""
+        filters = [(self.names, self._constants), (ROWS if self._learns_lens else (), self._rows)]
+        return {
+            name: (float(value), math.sqrt(variance))
+            for names, learnt in filters
+            for name, value, variance in zip(
+                names, learnt.mean, np.diag(learnt.covariance), strict=False
+            )
+        }
 
     def _settle(self) -> None:
         """Say what registrations take off, from now on."""
-        learnt_px, longest_s = self.disparity.value, abs(self.readout.value) + self.readout.sigma
-        self.disparity_px = math.copysign(max(abs(learnt_px) - _FEIGNED_PX, 0.0), learnt_px)
-        is_rolling = abs(self.readout.value) > self.readout.sigma
-        self.readout_s = self.readout.value if is_rolling else 0.0
-        is_possible = is_rolling or longest_s > _LEAST_READOUT_S
-        self.possible_readout_s = (
-            math.hypot(self.readout_s, self.readout.sigma) if is_possible else 0.0
-        )
+        n_lens, learnt = len(LENS) if self._learns_lens else 0, self._constants
+        if self._learns_lens:
+            constants = learnt.mean[:n_lens]
+            field = np.einsum("k,kni->ni", constants, self._grid)
+            size_px = math.sqrt(np.mean(np.sum(field**2, axis=1)))
+            is_told = learnt.significance(slice(n_lens)) > _GATE and size_px > _FEIGNED_PX
+            self.lens = (1.0 - _FEIGNED_PX / size_px) * constants if is_told else 0.0 * constants
+            self.rows = self._rows.mean
+        if self._readout_ms is None:
+            variance = float(learnt.covariance[n_lens, n_lens])
+            self.readout = float(learnt.mean[n_lens]), math.sqrt(variance)
+        value, sigma = self.readout
+        is_rolling = abs(value) > (_GATE if self._is_stereo else 1.0) * sigma
+        self.readout_s = value if is_rolling else 0.0
+        is_possible = is_rolling or abs(value) + sigma > _LEAST_READOUT_S
+        self.possible_readout_s = math.hypot(self.readout_s, sigma) if is_possible else 0.0
 
     def reconfigure(self, config: Config) -> None:
         """Forget the variance factors where another front-end states other covariances."""
@@ -192,44 +237,76 @@ class RigOffsets:
             self._sigma_factor = sigma_factor
             self.chain_factor, self.window_factor = map(VarianceFactor, [sigma_factor] * 2)
 
-    def note_disparity(self, error: ConstantError | None) -> None:
-        """Take what a step tells of the disparities, after the present value was subtracted."""
-        self._disparity_error = error
+    def take_off(self, uvd: FloatArray) -> FloatArray:
+        """Return measured (u, v, disparity), shape (n, 3), without the errors of the lens."""
+        ideal = np.empty_like(uvd)
+        kernels.take_off_all(uvd, self.lens, self._camera.parameters, ideal)
+        return ideal
 
-    def note_readout(self, error: ConstantError, result: RelativePose) -> None:
-        """Take what a registration tells of the readout, after the present value was subtracted."""
-        # Matches that a wrong readout time contradicts are outliers, the others confirm it.
-        self._readout_errors.append(error.widened((result.n_matches / result.n_inliers) ** 2))
+    def row_errors(self, pixels: FloatArray) -> FloatArray:
+        """Return by how much rows of the right image are too large, pixels."""
+        errors = np.empty((1, len(pixels)))
+        parameters = self._camera.parameters
+        kernels.write_row_errors(pixels, self.rows[np.newaxis], parameters, errors)
+        return np.asarray(errors[0])
 
-    def note_rows(self, row_px: float | None) -> None:
-        """Take what a step's reference tells: row in the right image minus row in the left."""
-        if DISPARITY in self.learnt:
-            self._row_px = row_px
+    def lens_fields(self, uvd: FloatArray) -> FloatArray:
+        """Return the errors of (u, v, disparity) by a unit of each of `LENS`, shape (11, n, 3)."""
+        fields = np.empty((len(LENS), len(uvd), 3))
+        kernels.write_lens_fields(uvd, self._camera.parameters, fields)
+        return fields
+
+    def _row_fields(self, pixels: FloatArray) -> FloatArray:
+        """Return the errors of rows by a unit of each of `ROWS`, shape (6, n)."""
+        fields = np.empty((len(ROWS), len(pixels)))
+        kernels.write_row_errors(pixels, np.eye(len(ROWS)), self._camera.parameters, fields)
+        return fields
+
+    def note(self, told: Constants) -> None:
+        """Take what a link tells of the constants, beside those that are taken off."""
+        used = [*self.lens] if self._learns_lens else []
+        used += [self.readout_s] if self._readout_ms is None else []
+        self._constants.note(told.information, told.score, np.array(used))
+
+    def note_rows(self, pixels: FloatArray, shifts_px: FloatArray) -> None:
+        """Take by how much rows of the right image are larger at pixels (n, 2), as measured.
+
+        NaN tells nothing. The constants are those of the least robust cost (Cauchy).
+        """
+        told = np.flatnonzero(np.isfinite(shifts_px))
+        if not self._learns_lens or len(told) < _MIN_ROWS:
+            return
+        told = told[:: -(-len(told) // _MAX_ROWS)]
+        fields = self._row_fields(pixels[told])
+        left = shifts_px[told] - self.rows @ fields
+        step: FloatArray = np.zeros(len(ROWS))
+        for _ in range(_N_ROW_STEPS):
+            weights = 1.0 / (1.0 + ((left - step @ fields) / _ROW_KERNEL_PX) ** 2)
+            weighted = fields * weights / _ROW_SIGMA_PX**2
+            information, score = weighted @ fields.T, weighted @ left
+            step = np.linalg.solve(information + self._rows.information, score)
+        self._rows.note(information, score, self.rows)
 
     def advance(self) -> None:
-        """Apply the measurements taken since the last frame."""
-        for constant in (self.disparity, self.row, self.readout):
-            constant.advance()
-        if self._disparity_error is not None:
-            error = self._disparity_error
-            left_px = self.disparity_px + error.value - self.disparity.value
-            self.disparity.update(left_px, _DISPARITY_FACTOR * error.sigma)
-        if self._row_px is not None:
-            self.row.update(self._row_px - self.row.value, _ROW_SIGMA_PX)
-        for error in self._readout_errors:
-            left_s = self.readout_s + error.value - self.readout.value
-            self.readout.update(left_s, _READOUT_FACTOR * error.sigma)
-        self._disparity_error, self._row_px, self._readout_errors = None, None, []
+        """Apply what was noted since the last frame."""
+        self._constants.advance()
+        self._rows.advance()
         self._settle()
 
     def as_json(self) -> dict[str, float]:
-        """Return values and sigmas as plain numbers; a sigma of 0: it was given."""
+        """Return by how much what is seen anywhere is off, as taken off, and the readout.
+
+        A readout with a sigma of 0 was given.
+        """
+        value, sigma = self.readout
+        u, v, disparity = np.abs(np.einsum("k,kni->in", self.lens, self._grid))
+        rows = self.row_errors(self._places) if self._learns_lens else np.zeros(1)
         offsets = {
-            "disparity_px": round(self.disparity.value, 4),
-            "disparity_sigma_px": round(self.disparity.sigma, 4),
-            "row_px": round(self.row.value, 4),
+            "disparity_px": round(float(disparity.max()), 4),
+            "pixel_px": round(float(np.hypot(u, v).max()), 4),
+            "row_px": round(float(np.abs(rows).max()), 4),
         }
         return (offsets if self._is_stereo else {}) | {
-            "readout_ms": round(1e3 * self.readout.value, 2),
-            "readout_sigma_ms": round(1e3 * self.readout.sigma, 2),
+            "readout_ms": round(1e3 * value, 2),
+            "readout_sigma_ms": round(1e3 * sigma, 2),
         }

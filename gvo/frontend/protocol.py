@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sized
-from typing import Any, Generic, Protocol, TypeAlias, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import numpy as np
 
 from gvo.config import Config
-from gvo.frontend.offsets import RigOffsets
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.types import Failure, FloatArray, MotionPrior, RelativePose, Stamped
+
+if TYPE_CHECKING:
+    from gvo.frontend.offsets import RigOffsets
 
 # Frames and observations of the front-end's own kind.
 _Own: TypeAlias = Any
@@ -166,6 +168,8 @@ class CheckedFrontend(Generic[ObservationsT]):
     @property
     def rig_offsets(self) -> RigOffsets | None:
         """What is learnt of the camera; None where the front-end does not learn."""
+        from gvo.frontend.offsets import RigOffsets  # loads compiled loops
+
         offsets = None if self._learner is None else self._learner.rig_offsets
         return offsets if isinstance(offsets, RigOffsets) else None
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from gvo.config import Config
 from gvo.frontend.matching import mutual_best
+from gvo.frontend.offsets import RigOffsets
 from gvo.frontend.verification import verify_motion
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
@@ -191,7 +192,7 @@ def _conclude(
         pixels_current=pixels[1],
         points_current=correspondences.current_points,
         flow_px=median(np.hypot(*displacements.T).tolist()),
-        calibration_errors=refined.calibration_errors,
+        effects=refined.effects,
     )
 
 
@@ -231,7 +232,7 @@ def register_anywhere(
     camera: StereoCamera,
     config: Config,
     *,
-    offset_px: float,
+    offsets: RigOffsets,
 ) -> RelativePose | Failure:
     """Estimate the motion between two frames far apart; the view has to confirm it.
 
@@ -244,8 +245,8 @@ def register_anywhere(
         Of both frames.
     config : Config
         Sections `ransac` and `registration`; fewer matches have to agree than between neighbours.
-    offset_px : float
-        To be taken off all disparities.
+    offsets : RigOffsets
+        What is taken off all measurements.
 
     Returns
     -------
@@ -256,8 +257,11 @@ def register_anywhere(
         "n_hypotheses": max(ransac.n_hypotheses, _N_HYPOTHESES),
         "min_inliers": min(ransac.min_inliers, n_needed),
     }
+    found = Correspondences.of(reference, current, matches)
+    uvd = offsets.take_off(found.reference_uvd), offsets.take_off(found.current_uvd)
+    sigmas = found.reference_sigmas, found.current_sigmas
     return register_correspondences(
-        Correspondences.of(reference, current, matches).without_offset(offset_px, camera),
+        Correspondences.of_pixels(uvd, sigmas, camera),
         matches,
         camera,
         config.model_copy(update={"ransac": ransac.model_copy(update=few)}),

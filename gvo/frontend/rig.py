@@ -1,11 +1,9 @@
-"""Online calibration of constants of the camera: disparity and row offsets, and readout time.
+"""Registration by a camera whose constants are learnt: lens, rows and readout time.
 
-A baseline, a principal point or a rectification that is slightly off adds the same fraction of a
-pixel to every disparity: a large change of depth for far points, a small one for near ones, so
-that they disagree about the motion. A row offset shows in each match. A rolling shutter exposes the
-rows of an image one after the other, which bends the world of a camera that moves. Registrations
-tell of these; over a second of a recording they are known to a few hundredths of a pixel, and to
-a millisecond.
+What a calibration leaves changes smoothly over the image: points near and far, and at either side
+of the view, disagree about the motion. A rolling shutter exposes the rows of an image one after the
+other, which bends the world of a camera that moves. Links to keyframes tell of both; what they
+tell is held by `gvo.frontend.offsets`.
 
 References
 ----------
@@ -22,13 +20,13 @@ from typing import Protocol
 import numpy as np
 
 from gvo.config import Config
-from gvo.frontend.offsets import DISPARITY, READOUT, RigOffsets
+from gvo.frontend.offsets import LENS, READOUT, RigOffsets
 from gvo.frontend.registration import check_rows, estimate_roughly, register_correspondences
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.ransac import find_inliers
-from gvo.geometry.refinement import Adjustment, adjust, estimate_constants
+from gvo.geometry.refinement import Adjustment, adjust, eliminate_pose
 from gvo.geometry.residuals import StereoResiduals
 from gvo.kernels import shutter
 from gvo.types import (
@@ -216,8 +214,8 @@ class CalibratedCamera:
         self._camera, self._offsets = camera, offsets
         # Those of the last registration that was found, and is not accepted yet.
         self._found: Measurements | None = None
-        # Those of the newest frame, its step first.
-        self._accepted: list[tuple[Measurements, RelativePose]] = []
+        # Those of the newest frame.
+        self._links: list[tuple[Measurements, RelativePose]] = []
 
     def correct(self, observations: Moving, uvd: FloatArray) -> FloatArray:
         """Return measured (u, v, disparity), shape (n, 3), as a camera without errors has them."""
@@ -226,14 +224,14 @@ class CalibratedCamera:
         if velocity is None:
             velocity, readout_s = _AT_REST, 0.0
         camera = self._camera.parameters
-        shutter.settle_rows(uvd, offsets.disparity_px, velocity, readout_s, camera, settled)
+        shutter.settle_rows(uvd, offsets.lens, velocity, readout_s, camera, settled)
         return settled
 
-    def bends(self, reference: Moving, current: Moving) -> tuple[float, FloatArray, float]:
-        """Return what bends the measurements of two frames: offset, velocities (2, 6), readout."""
+    def bends(self, reference: Moving, current: Moving) -> tuple[FloatArray, FloatArray, float]:
+        """Return what bends measurements: lens (11,), velocities (2, 6) of two frames, readout."""
         velocities = [each.motion.velocity for each in (reference, current)]
         known = np.array([_AT_REST if each is None else each for each in velocities])
-        return self._offsets.disparity_px, known, self._offsets.readout_s
+        return self._offsets.lens, known, self._offsets.readout_s
 
     def register(
         self, measured: Measurements, config: Config, *, prior: MotionPrior | None, is_step: bool
@@ -301,10 +299,9 @@ class CalibratedCamera:
         if measured is None:
             return
         if is_step:
-            self._offsets.note_disparity(result.calibration_errors.get(DISPARITY))
-            self._learn_readout(measured.frames[0])
-        if READOUT in self._offsets.learnt:
-            self._accepted.append((measured, result))
+            self._learn(measured.frames[0])
+        elif self._offsets.names:
+            self._links.append((measured, result))
 
     def _register(
         self,
@@ -323,10 +320,8 @@ class CalibratedCamera:
             return result
         T_correction = se3.exp(measured.frames[0].motion.error())
         # In sigmas of what is known of each constant, as the sensitivities are.
-        constants = result.calibration_errors
-        effects = {name: np.zeros(6) for name in (DISPARITY, READOUT, *_VELOCITIES)}
-        effects |= {name: each.effect for name, each in constants.items()}
-        by_learnt, by_axis = np.split(np.array([*effects.values()]), [2])
+        effects = {name: np.zeros(6) for name in (READOUT, *_VELOCITIES)} | {**result.effects}
+        by_learnt, by_axis = np.split(np.array([*effects.values()]), [1])
         known = np.eye(len(by_axis))
         told = measured.frames[1].motion.measured
         if told is not None:
@@ -341,11 +336,6 @@ class CalibratedCamera:
             + by_learnt.T @ by_learnt
             + by_velocity,
             passing_covariance=by_velocity,
-            calibration_errors={
-                name: each.times(self._offsets.learnt[name].sigma)
-                for name, each in constants.items()
-                if name in self._offsets.learnt
-            },
             pixels_reference=measured.uvd[0][:, :2],
             pixels_current=measured.uvd[1][:, :2],
         )
@@ -399,17 +389,9 @@ class CalibratedCamera:
         told = measured.frames[1].motion.measured
         is_adjusted = told is not None and T_start is not None
         corrected = self._corrected(measured)
-        sensitivities, learnt = {}, self._offsets.learnt
-        if DISPARITY in learnt:
-            by_disparity = np.array([0.0, 0.0, learnt[DISPARITY].sigma])
-            sensitivities[DISPARITY] = np.tile(by_disparity, (2, len(corrected), 1))
-        if READOUT in learnt:
-            offset_px, velocities, _ = self.bends(*measured.frames)
-            rates = np.empty((2, len(corrected), 3))
-            for uvd, velocity, out in zip(measured.uvd, velocities, rates, strict=True):
-                camera = self._camera.parameters
-                shutter.write_readout_rates(uvd, offset_px, velocity, camera, out)
-            sensitivities[READOUT] = -learnt[READOUT].sigma * rates
+        sensitivities, readout_sigma_s = {}, self._offsets.readout[1]
+        if readout_sigma_s > 0.0:
+            sensitivities[READOUT] = readout_sigma_s * self._by_readout(measured)
         sigmas = measured.frames[1].motion.sigmas
         # What a readout that is not known yet may do counts, too.
         readout_s = self._offsets.possible_readout_s
@@ -417,20 +399,31 @@ class CalibratedCamera:
             sensitivities |= self._by_velocity(corrected, sigmas, readout_s)
         return replace(corrected, sensitivities=sensitivities)
 
-    def _learn_readout(self, frame: Moving) -> None:
-        """Take what a frame tells of the readout, now that the step after it is known, too.
+    def _by_readout(self, measured: Measurements) -> FloatArray:
+        """Return the derivatives of corrected measurements by an error of the readout time."""
+        lens, velocities, _ = self.bends(*measured.frames)
+        rates, camera = np.empty((2, len(measured.matches), 3)), self._camera.parameters
+        for uvd, velocity, out in zip(measured.uvd, velocities, rates, strict=True):
+            shutter.write_readout_rates(uvd, lens, velocity, camera, out)
+        return -rates
 
-        Keyframes tell it best, seen by a camera that moved another way; its step counts without
-        them, until the readout is known to take no time. A velocity that is extrapolated would not
-        do: changes of velocity that are noise look like a shorter readout.
+    def _learn(self, frame: Moving) -> None:
+        """Take what the links of a frame tell of the camera, now that the step after it is known.
+
+        Keyframes tell it best, seen by a camera that moved another way. A velocity that is
+        extrapolated would not do: changes of velocity that are noise look like a shorter readout.
         """
-        told_by = [each for each in self._accepted if each[0].frames[1] is frame]
-        self._accepted = []
-        links = told_by[1:]
-        for measured, result in links or (told_by if self._offsets.possible_readout_s else ()):
+        links, self._links = self._links, []
+        names = self._offsets.names
+        for measured, result in links:
+            if measured.frames[1] is not frame:
+                continue
+            fields = np.stack([self._offsets.lens_fields(uvd) for uvd in measured.uvd], axis=1)
+            by_name = {**dict(zip(LENS, fields, strict=True)), READOUT: self._by_readout(measured)}
+            sensitivities = {name: by_name[name] for name in names}
+            prepared = replace(self._corrected(measured), sensitivities=sensitivities)
             T = result.T_reference_current
-            prepared = self.prepare(measured, None)
             residuals = StereoResiduals.of(T, prepared, self._camera)
-            told = estimate_constants(T, residuals, result.inliers)
-            if READOUT in told:
-                self._offsets.note_readout(told[READOUT].times(self._offsets.readout.sigma), result)
+            told = eliminate_pose(T, residuals, result.inliers)
+            if told is not None:
+                self._offsets.note(told)

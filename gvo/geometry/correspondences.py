@@ -75,14 +75,6 @@ class Correspondences:
             current_sigmas=sigmas[1],
         )
 
-    def without_offset(self, offset_px: float, camera: StereoCamera) -> Correspondences:
-        """Subtract a constant offset from all disparities, and back-project again."""
-        if offset_px == 0.0:
-            return self
-        offset = np.array([0.0, 0.0, offset_px])
-        uvd = self.reference_uvd - offset, self.current_uvd - offset
-        return Correspondences.of_pixels(uvd, (self.reference_sigmas, self.current_sigmas), camera)
-
     def select(self, chosen: BoolArray | IntArray) -> Correspondences:
         """Return some of the correspondences."""
         return Correspondences(

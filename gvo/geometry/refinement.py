@@ -29,7 +29,7 @@ from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.residuals import HUBER, StereoResiduals
 from gvo.kernels import refinement as kernels
-from gvo.types import BoolArray, ConstantError, Failure, FloatArray
+from gvo.types import BoolArray, Failure, FloatArray
 
 GATE = 3.0
 """Maximum whitened residual of an inlier of a refined pose, sigmas."""
@@ -55,8 +55,8 @@ class Refinement:
         Weighted root mean square of the whitened residuals; one if the sigmas are right.
     residuals : StereoResiduals
         Of all matches, whitened at the start value.
-    calibration_errors : mapping of str to ConstantError
-        See `estimate_constants`.
+    effects : mapping of str to ndarray of float64, shape (6,)
+        By how much a unit of each constant of the residuals moves the pose.
     """
 
     T_reference_current: FloatArray
@@ -64,7 +64,7 @@ class Refinement:
     inliers: BoolArray
     scale: float
     residuals: StereoResiduals
-    calibration_errors: Mapping[str, ConstantError] = field(default_factory=dict)
+    effects: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
 def refine_pose(
@@ -218,22 +218,41 @@ def _with_covariance(
     )
     if ended != kernels.DONE:
         return Failure(reason=_REASONS[ended])
+    told = eliminate_pose(T, residuals, inliers) if residuals.constants else None
     return Refinement(
         T_reference_current=T,
         covariance=covariance,
         inliers=inliers,
         scale=float(scale[0]),
         residuals=residuals,
-        calibration_errors=estimate_constants(T, residuals, inliers),
+        effects={} if told is None else dict(zip(residuals.constants, told.effects, strict=True)),
     )
 
 
-def estimate_constants(
-    T_reference_current: FloatArray, residuals: StereoResiduals, is_used: BoolArray
-) -> dict[str, ConstantError]:
-    """Estimate the errors of constants of the camera, each beside the pose and the others.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Constants:
+    """What matches tell of errors of k constants of the camera, whatever the pose.
 
-    Errors are in units of what is known of them: the others are around zero by a sigma of one.
+    Parameters
+    ----------
+    information : ndarray of float64, shape (k, k)
+        Of the errors, by what no motion explains.
+    score : ndarray of float64, shape (k,)
+        The right-hand side: the errors are information^-1 score.
+    effects : ndarray of float64, shape (k, 6)
+        By how much one unit of each moves the pose (rx, ry, rz, tx, ty, tz), in the current
+        camera frame.
+    """
+
+    information: FloatArray
+    score: FloatArray
+    effects: FloatArray
+
+
+def eliminate_pose(
+    T_reference_current: FloatArray, residuals: StereoResiduals, is_used: BoolArray
+) -> Constants | None:
+    """Return the normal equations of the constants of residuals; None where there are none.
 
     Parameters
     ----------
@@ -243,24 +262,13 @@ def estimate_constants(
         Of n matches.
     is_used : ndarray of bool, shape (n,)
         Those that count.
-
-    Returns
-    -------
-    dict of str to ConstantError
-        By name, without those that are unobservable: for points at one depth an offset of the
-        disparities acts as a motion does.
     """
-    if not residuals.constants:
-        return {}
-    told = np.empty((len(residuals.constants), 8))
-    ended = kernels.estimate_constants(
+    k = len(residuals.constants)
+    information, score, effects = np.empty((k, k)), np.empty(k), np.empty((k, 6))
+    ended = kernels.eliminate_pose(
         *(np.array(T_reference_current), *residuals.arrays, is_used, residuals.sensitivities),
-        *(residuals.camera.parameters, residuals.huber, told),
+        *(residuals.camera.parameters, residuals.huber, information, score, effects),
     )
-    return {
-        name: ConstantError(value=float(value), sigma=float(sigma), effect=effect)
-        for name, (value, sigma, *_), effect in zip(
-            residuals.constants, told, told[:, 2:], strict=True
-        )
-        if ended == kernels.DONE and np.isfinite(value)
-    }
+    if ended != kernels.DONE:
+        return None
+    return Constants(information=information, score=score, effects=effects)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from gvo.kernels.jit import In, Out, kernel
+from gvo.kernels.lens import put_on, take_off
 from gvo.kernels.residuals import MIN_DEPTH_M, seen_from
 from gvo.kernels.shutter import settle
 
@@ -13,18 +14,18 @@ _MAX_SLOPE = 0.75
 
 
 @kernel(
-    *(In("f8", 2), In("f8", 2), Out("f8", 2), "f8", In("f8", 2), "f8", In("f8", 1)),
+    *(In("f8", 2), In("f8", 2), Out("f8", 2), In("f8", 1), In("f8", 2), "f8", In("f8", 1)),
     *(Out("i8", 1), Out("f8", 2), Out("f8", 3), Out("f8", 2)),
     returns="i8",
 )
 def predict(
-    uvd, slopes, T, offset_px, velocities, readout_s, camera, indices, seen, warps, moved_slopes
+    uvd, slopes, T, lens, velocities, readout_s, camera, indices, seen, warps, moved_slopes
 ):
     """Write which of n corners a motion brings into view, where, and how warped; return how many.
 
     Measurements (u, v, disparity) of the reference and the slopes of its disparities (n, 2); T is
-    T_reference_current; the offset is in all disparities; velocities (2, 6) of both frames bend
-    their rows. What is seen is what this camera measures, offset and rows included.
+    T_reference_current; the lens errors are in all of them; velocities (2, 6) of both frames bend
+    their rows. What is seen is what this camera measures, errors and rows included.
 
     The surface at a pixel is a plane: its inverse depth is linear in the pixel. Then a pixel x,
     in coordinates of the ray, goes to R x + t (n . x), divided by its third component, and the
@@ -35,20 +36,21 @@ def predict(
     tx, ty, tz = seen_from(T, (0.0, 0.0, 0.0))
     n_seen = 0
     for k in range(len(uvd)):
-        d = uvd[k, 2] - offset_px
-        u, v, settled = settle((uvd[k, 0], uvd[k, 1], d), velocities[0], readout_s, camera)
+        ideal = take_off(uvd[k], lens, camera)
+        u, v, settled = settle(ideal, velocities[0], readout_s, camera)
         z = fx * baseline / settled
         x, y, z = seen_from(T, ((u - cx) / fx * z, (v - cy) / fy * z, z))
         if not z > MIN_DEPTH_M:
             continue
         place = fx * x / z + cx, fy * y / z + cy, fx * baseline / z
-        u, v, disparity = settle(place, velocities[1], -readout_s, camera)
+        moved = settle(place, velocities[1], -readout_s, camera)
+        u, v, disparity = put_on(moved, lens, camera)
         if not (0.0 <= u <= camera[5] - 1.0 and 0.0 <= v <= camera[6] - 1.0):
             continue
         indices[n_seen] = k
-        seen[n_seen, 0], seen[n_seen, 1], seen[n_seen, 2] = u, v, disparity + offset_px
+        seen[n_seen, 0], seen[n_seen, 1], seen[n_seen, 2] = u, v, disparity
 
-        x, y, inverse_depth = (uvd[k, 0] - cx) / fx, (uvd[k, 1] - cy) / fy, d / (fx * baseline)
+        x, y, inverse_depth = (ideal[0] - cx) / fx, (ideal[1] - cy) / fy, ideal[2] / (fx * baseline)
         a, b = slopes[k, 0] / (fx * baseline), slopes[k, 1] / (fx * baseline)
         X = T[0, 0] * x + T[1, 0] * y + T[2, 0] + inverse_depth * tx
         Y = T[0, 1] * x + T[1, 1] * y + T[2, 1] + inverse_depth * ty

@@ -39,10 +39,6 @@ _N_PROMISED = 24
 # Largest ratio of variances with and without the curvature of the kernel: if long residuals alone
 # constrain a direction, their curvature is no measure of it.
 _MAX_LOSS = 10.0
-# Information on a constant, relative to that of the current measurements alone, below which it is
-# rounding.
-_MIN_SHARE = 1e-10
-
 # Points, measurements, factors, which are used. What is written by one kernel is writeable for all:
 # helpers are compiled once for each kind of array.
 _MATCHES = In("f8", 2), In("f8", 2), In("f8", 2), Out("b1", 1)
@@ -212,45 +208,34 @@ def _write_constants(T, point, sensitivities, k, camera, J, rows):
             rows[6 + c, i] = now[i] - moved
 
 
-@helper
-def _estimate_one(c, information, scatter, sums, told):
-    """Write value and standard deviation of one constant that is free; the others are known."""
-    n_constants = len(sums)
-    known, gain = matrix(n_constants, n_constants), vector(n_constants)
-    copy(information, known)
-    for d in range(n_constants):
-        known[d, d] += 0.0 if d == c else 1.0
-        gain[d] = 1.0 if d == c else 0.0
-    if not solve(known, gain):
-        return
-    variance = 0.0
-    for d in range(n_constants):
-        variance += 0.0 if d == c else gain[d] * gain[d]
-        for e in range(n_constants):
-            variance += gain[d] * scatter[d, e] * gain[e]
-    told[0], told[1] = dot(gain, sums), np.sqrt(variance)
-
-
 @kernel(
-    *(Out("f8", 2), *_MATCHES, In("f8", 4), In("f8", 1), "f8", Out("f8", 2)),
+    *(Out("f8", 2), *_MATCHES, In("f8", 4), In("f8", 1), "f8"),
+    *(Out("f8", 2), Out("f8", 1), Out("f8", 2)),
     returns="i8",
 )
-def estimate_constants(T, points, uvd, factors, is_used, sensitivities, camera, huber, told):
-    """Write the error of each of k constants beside the pose and the others: told (k, 8).
+def eliminate_pose(
+    T,
+    points,
+    uvd,
+    factors,
+    is_used,
+    sensitivities,
+    camera,
+    huber,
+    information,
+    score,
+    effects,
+):
+    """Write the normal equations of the errors of k constants, whatever the pose; how it ended.
 
-    Value, standard deviation, and by how much one unit moves the pose (6). The value is NaN where
-    the matches do not tell: for points at one depth an offset of the disparities acts as a motion
-    does. Errors are in units of what is known of them: the others are around zero by a sigma of
-    one. The standard deviation is that of the sample. Return how it ended.
+    Their information (k, k) and score (k): what no motion explains (the Schur complement). Effects
+    (k, 6): by how much one unit of each moves the pose.
     """
-    n, n_constants = len(points), len(sensitivities)
+    n_constants = len(sensitivities)
     size = 6 + n_constants
-    A, rows, sum_of_rows = matrix(size, size), matrix(size, 3), vector(size)
-    r, J, alone = vector(3), matrix(3, 3), vector(n_constants)
-    clear(A, sum_of_rows)
-    for c in range(n_constants):
-        alone[c] = 0.0
-    for k in range(n):
+    A, b, rows, r, J = matrix(size, size), vector(size), matrix(size, 3), vector(3), matrix(3, 3)
+    clear(A, b)
+    for k in range(len(points)):
         if not is_used[k]:
             continue
         root = _linearize(T, points[k], uvd[k], factors[k], camera, huber, rows, r)
@@ -259,51 +244,26 @@ def estimate_constants(T, points, uvd, factors, is_used, sensitivities, camera, 
         _write_constants(T, points[k], sensitivities, k, camera, J, rows)
         for c in range(n_constants):
             whiten(factors[k], root, rows[6 + c])
-            for m in range(3):
-                r[m] = sensitivities[c, 1, k, m]
-            whiten(factors[k], root, r)
-            alone[c] += dot(r, r)
         for i in range(size):
+            b[i] += dot(rows[i], r)
             for j in range(size):
                 A[i, j] += dot(rows[i], rows[j])
-    factor, motion = matrix(6, 6), matrix(n_constants, 6)
+    factor = matrix(6, 6)
     copy(A, factor)
-    for c in range(n_constants):
-        for i in range(6):
-            motion[c, i] = A[6 + c, i]
     if not factorize(factor):
         return OPEN
     for c in range(n_constants):
-        substitute(factor, motion[c])
-    # Schur complement: what no motion explains; and the scores of each match.
-    information, sums = matrix(n_constants, n_constants), vector(n_constants)
-    scatter, score = matrix(n_constants, n_constants), vector(n_constants)
-    unexplained = matrix(n_constants, 3)
-    clear(information, sums)
-    clear(scatter, score)
-    for k in range(n):
-        if not is_used[k]:
-            continue
-        root = _linearize(T, points[k], uvd[k], factors[k], camera, huber, rows, r)
-        _write_constants(T, points[k], sensitivities, k, camera, J, rows)
-        for c in range(n_constants):
-            whiten(factors[k], root, rows[6 + c])
-            for m in range(3):
-                unexplained[c, m] = rows[6 + c, m]
-                for i in range(6):
-                    unexplained[c, m] -= motion[c, i] * rows[i, m]
-            score[c] = dot(unexplained[c], r)
-            sums[c] += score[c]
-        for c in range(n_constants):
-            for d in range(n_constants):
-                information[c, d] += dot(unexplained[c], unexplained[d])
-                scatter[c, d] += score[c] * score[d]
-    for c in range(n_constants):
-        told[c, 0] = np.nan
-        if information[c, c] > _MIN_SHARE * alone[c]:
-            _estimate_one(c, information, scatter, sums, told[c])
         for i in range(6):
-            told[c, 2 + i] = motion[c, i]
+            effects[c, i] = A[6 + c, i]
+        substitute(factor, effects[c])
+    for c in range(n_constants):
+        score[c] = b[6 + c]
+        for i in range(6):
+            score[c] -= effects[c, i] * b[i]
+        for d in range(n_constants):
+            information[c, d] = A[6 + c, 6 + d]
+            for i in range(6):
+                information[c, d] -= effects[c, i] * A[6 + d, i]
     return DONE
 
 

@@ -9,6 +9,7 @@ pose; a camera is an array (fx, fy, cx, cy, baseline, width, height).
 from __future__ import annotations
 
 from gvo.kernels.jit import In, Out, helper, kernel, matrix
+from gvo.kernels.lens import take_off
 from gvo.kernels.residuals import write_pose_jacobian
 
 # Moved to the middle of the exposure, points must stay in front of the camera.
@@ -55,25 +56,25 @@ def settle(uvd, velocity, readout_s, camera):
     return (u - cx + fx * x) / z + cx, (v - cy + fy * y) / z + cy, disparity / z
 
 
-@kernel(In("f8", 2), "f8", In("f8", 1), "f8", In("f8", 1), Out("f8", 2))
-def settle_rows(uvd, offset_px, velocity, readout_s, camera, settled):
-    """Write (u, v, disparity) less an offset as seen in the middle of the exposure."""
+@kernel(In("f8", 2), In("f8", 1), In("f8", 1), "f8", In("f8", 1), Out("f8", 2))
+def settle_rows(uvd, lens, velocity, readout_s, camera, settled):
+    """Write (u, v, disparity) without lens errors as seen in the middle of the exposure."""
     for k in range(len(uvd)):
-        measured = uvd[k, 0], uvd[k, 1], uvd[k, 2] - offset_px
-        u, v, disparity = settle(measured, velocity, readout_s, camera)
+        ideal = take_off(uvd[k], lens, camera)
+        u, v, disparity = settle(ideal, velocity, readout_s, camera)
         settled[k, 0], settled[k, 1], settled[k, 2] = u, v, disparity
 
 
-@kernel(In("f8", 2), "f8", In("f8", 1), In("f8", 1), Out("f8", 2))
-def write_readout_rates(uvd, offset_px, velocity, camera, rates):
+@kernel(In("f8", 2), In("f8", 1), In("f8", 1), In("f8", 1), Out("f8", 2))
+def write_readout_rates(uvd, lens, velocity, camera, rates):
     """Write the derivatives of settled (u, v, disparity) by the readout time."""
     for k in range(len(uvd)):
-        share = row_time(uvd[k, 1], camera)
-        measured = uvd[k, 0], uvd[k, 1], uvd[k, 2] - offset_px
-        a, b, c = _ray_rate(measured, velocity, camera)
-        rates[k, 0] = share * (camera[0] * a - (uvd[k, 0] - camera[2]) * c)
-        rates[k, 1] = share * (camera[1] * b - (uvd[k, 1] - camera[3]) * c)
-        rates[k, 2] = -share * measured[2] * c
+        ideal = take_off(uvd[k], lens, camera)
+        share = row_time(ideal[1], camera)
+        a, b, c = _ray_rate(ideal, velocity, camera)
+        rates[k, 0] = share * (camera[0] * a - (ideal[0] - camera[2]) * c)
+        rates[k, 1] = share * (camera[1] * b - (ideal[1] - camera[3]) * c)
+        rates[k, 2] = -share * ideal[2] * c
 
 
 @kernel(In("f8", 2), In("f8", 2), In("f8", 1), "f8", In("f8", 1), Out("f8", 3))

@@ -328,7 +328,16 @@ def _row_shift(wide, patch, seen):
 
 
 @kernel(
-    *(In("u1", 2), In("u1", 2), In("f8", 2), In("f8", 1), In("b1", 1), In("f8", 2), "f8", "b1"),
+    *(
+        In("u1", 2),
+        In("u1", 2),
+        In("f8", 2),
+        In("f8", 1),
+        In("b1", 1),
+        In("f8", 2),
+        In("f8", 1),
+        "b1",
+    ),
     *(Out("f8", 1), Out("f8", 2), Out("b1", 1), Out("f8", 1)),
 )
 def measure(
@@ -338,7 +347,7 @@ def measure(
     rough,
     is_found,
     rivals,
-    row_offset_px,
+    row_offsets_px,
     is_refined,
     disparities,
     slopes,
@@ -365,7 +374,7 @@ def measure(
         u, v = corners[k, 0], corners[k, 1]
         if not (is_found[k] and _have_room(left, u, v, rough[k])):
             continue
-        row, first_unlike = v + row_offset_px, np.inf
+        row, first_unlike = v + row_offsets_px[k], np.inf
         sample(left, u, v, 1.0, 0.0, 0.0, 1.0, RADIUS_PX + 1, RADIUS_PX + 1, wide)
         at_rest = _weigh(wide, patch, weights)
         limit = _MAX_UNLIKE * _variance(patch, nothing) + _UNLIKE_NOISE
@@ -410,10 +419,10 @@ def measure(
 
 
 @kernel(
-    *(In("u1", 2), In("u1", 2), In("f8", 2), In("f8", 1), In("f8", 2), "f8", "i8"),
+    *(In("u1", 2), In("u1", 2), In("f8", 2), In("f8", 1), In("f8", 2), In("f8", 1), "i8"),
     *(Out("f8", 1), Out("b1", 1)),
 )
-def follow(left, right, pixels, predicted, slopes, row_offset_px, n_steps, disparities, is_valid):
+def follow(left, right, pixels, predicted, slopes, row_offsets_px, n_steps, disparities, is_valid):
     """Measure the disparities of pixels (n, 2) from predictions that are right to a pixel or two.
 
     By Gauss-Newton steps; patches of the right image are sampled as those of surfaces of these
@@ -429,7 +438,7 @@ def follow(left, right, pixels, predicted, slopes, row_offset_px, n_steps, dispa
         sample(left, u, v, 1.0, 0.0, 0.0, 1.0, RADIUS_PX + 1, RADIUS_PX + 1, wide)
         along, across = slopes[k, 0], slopes[k, 1]
         sample(
-            *(right, u - start, v + row_offset_px, 1.0 - along, -across, 0.0, 1.0),
+            *(right, u - start, v + row_offsets_px[k], 1.0 - along, -across, 0.0, 1.0),
             *(reach, _RADIUS, strip),
         )
         at_rest = _weigh(wide, patch, weights)
@@ -440,10 +449,10 @@ def follow(left, right, pixels, predicted, slopes, row_offset_px, n_steps, dispa
 
 
 @kernel(
-    *(In("u1", 2), In("u1", 2), In("f8", 2), In("f8", 1), "f8", "b1"),
+    *(In("u1", 2), In("u1", 2), In("f8", 2), In("f8", 1), In("f8", 1), "b1"),
     *(Out("f8", 1), Out("b1", 1)),
 )
-def search_near(left, right, pixels, predicted, row_offset_px, is_refined, disparities, is_valid):
+def search_near(left, right, pixels, predicted, row_offsets_px, is_refined, disparities, is_valid):
     """Measure the disparities of pixels (n, 2) near predicted ones, wherever they match best.
 
     The least squared difference, by a parabola through it and its neighbours, and by Gauss-Newton
@@ -458,7 +467,7 @@ def search_near(left, right, pixels, predicted, row_offset_px, is_refined, dispa
         u, v, start = pixels[k, 0], pixels[k, 1], predicted[k]
         if not _have_room(left, u, v, start):
             continue
-        column, row = np.floor(u - start), v + row_offset_px
+        column, row = np.floor(u - start), v + row_offsets_px[k]
         sample(left, u, v, 1.0, 0.0, 0.0, 1.0, RADIUS_PX + 1, RADIUS_PX + 1, wide)
         sample(right, column, row, 1.0, 0.0, 0.0, 1.0, reach, _RADIUS, strip)
         at_rest = _weigh(wide, patch, weights)

@@ -227,13 +227,18 @@ def test_what_is_tried_before_a_frame_is_registered_teaches_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     noted: list[object] = []
-    monkeypatch.setattr(RigOffsets, "note_disparity", lambda _, error: noted.append(error))
+    monkeypatch.setattr(RigOffsets, "note", lambda _, told: noted.append(told))
     frontend = DescriptorFrontend(CAMERA, configure())
-    first, second = (frontend.extract(stereo_frame(x, stamp_ns=i)) for i, x in enumerate((0, 0.12)))
+    first, second, third = (
+        frontend.extract(stereo_frame(x, stamp_ns=i)) for i, x in enumerate((0, 0.12, 0.24))
+    )
     places = frontend.describe(first), frontend.describe(second)
     assert isinstance(frontend.recognize(*places, second), RelativePose)
-    assert noted == []
     assert isinstance(frontend.register(first, second), RelativePose)
+    link = MotionPrior(T_predicted=expect(0.12).T_predicted)
+    assert isinstance(frontend.register(first, second, link), RelativePose)
+    assert noted == []
+    assert isinstance(frontend.register(second, third), RelativePose)
     assert len(noted) == 1
 
 

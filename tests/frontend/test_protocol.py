@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from gvo.config import Config
+from gvo.frontend.descriptor import as_stereo
 from gvo.frontend.offsets import RigOffsets
 from gvo.frontend.protocol import CheckedFrontend, count_points, find_fault
 from gvo.geometry import se3
@@ -89,7 +90,7 @@ class Capable(Answering):
     def __init__(self, answer: object) -> None:
         super().__init__(answer)
         self.camera = CAMERA
-        self.rig_offsets = RigOffsets(Config(), is_stereo=True)
+        self.rig_offsets = RigOffsets(as_stereo(CAMERA), Config())
         self.configs: list[Config] = []
 
     def align_depth(self, reference: Any, current: Any, T_reference_current: Any) -> Any:

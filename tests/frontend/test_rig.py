@@ -21,12 +21,12 @@ from gvo.frontend.offsets import ConstantFilter, RigOffsets, VarianceFactor
 from gvo.frontend.rig import FrameMotion, MeasuredVelocity, note_step
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
-from gvo.geometry.refinement import Adjustment
+from gvo.geometry.lens import Lens
+from gvo.geometry.refinement import Adjustment, Constants
 from gvo.io.recording import Sensor
-from gvo.io.synthetic import SensorNoise
+from gvo.io.synthetic import RigError
 from gvo.kernels import shutter
 from gvo.types import (
-    ConstantError,
     Failure,
     FaultyFrame,
     FloatArray,
@@ -47,27 +47,21 @@ def settle_rows(
     uvd: FloatArray, velocity: FloatArray, readout_s: float, camera: StereoCamera
 ) -> FloatArray:
     settled = np.empty_like(uvd)
-    shutter.settle_rows(uvd, 0.0, velocity, readout_s, camera.parameters, settled)
+    shutter.settle_rows(uvd, np.zeros(11), velocity, readout_s, camera.parameters, settled)
     return settled
 
 
 def settling_rates(uvd: FloatArray, velocity: FloatArray, camera: StereoCamera) -> FloatArray:
     rates = np.empty_like(uvd)
-    shutter.write_readout_rates(uvd, 0.0, velocity, camera.parameters, rates)
+    shutter.write_readout_rates(uvd, np.zeros(11), velocity, camera.parameters, rates)
     return rates
 
 
-def result(*, n_inliers: int = 20, **errors: float) -> RelativePose:
-    return RelativePose(
-        matches=np.zeros((20, 2), dtype=np.int64),
-        inliers=np.arange(20) < n_inliers,
-        T_reference_current=np.eye(4),
-        covariance=np.eye(6),
-        calibration_errors={
-            name: ConstantError(value=value, sigma=0.1 * abs(value), effect=np.zeros(6))
-            for name, value in errors.items()
-        },
-    )
+def told(errors: dict[str, float], sigma: float, names: tuple[str, ...]) -> Constants:
+    """Return what a link tells: how much is left of some constants, each with this sigma."""
+    information = np.diag([sigma**-2 if name in errors else 0.0 for name in names])
+    score = information @ [errors.get(name, 0.0) for name in names]
+    return Constants(information=information, score=score, effects=np.zeros((len(names), 6)))
 
 
 def config(readout_ms: float | None = None, *, estimate_offset: bool = True) -> Config:
@@ -77,38 +71,30 @@ def config(readout_ms: float | None = None, *, estimate_offset: bool = True) -> 
 
 
 @settings(max_examples=30)
-@given(true=st.floats(-0.2, 0.2), seed=st.integers(0, 999))
-def test_the_filter_finds_a_constant_within_its_sigma(true: float, seed: int) -> None:
+@given(true=st.lists(st.floats(-0.2, 0.2), min_size=3, max_size=3), seed=st.integers(0, 999))
+def test_the_filter_finds_constants_within_their_sigmas(true: list[float], seed: int) -> None:
     rng = np.random.default_rng(seed)
-    found = ConstantFilter(0.3, 5e-4)
+    found = ConstantFilter(np.zeros(3), np.full(3, 0.3))
     for _ in range(200):
-        found.update(true + 0.1 * rng.normal() - found.value, 0.1)
-    assert abs(found.value - true) < 4.5 * found.sigma
-    assert found.sigma < 0.012
+        J, used = rng.normal(size=(20, 3)), rng.normal(size=3)
+        # Errors of registrations are correlated: sigmas are three times larger.
+        left = J @ (true - used) + 3.0 * rng.normal(size=20)
+        found.note(J.T @ J, J.T @ left, used)
+        found.advance()
+    error = found.mean - true
+    assert error @ np.linalg.solve(found.covariance, error) < 4.5**2 * 3
+    assert np.diag(found.covariance).max() < 0.06**2
 
 
-def test_what_is_not_measured_stays_at_the_prior() -> None:
-    for prior in (0.0, 0.3):
-        found = ConstantFilter(0.1, 5e-4, prior)
-        for _ in range(100):
-            found.advance()
-            found.update(0.5, 50.0)
-        assert abs(found.value - prior) < 0.02
-        assert found.sigma == pytest.approx(0.1, rel=0.05)
-
-
-def test_what_is_given_is_not_learnt() -> None:
-    found = ConstantFilter(0.0, 0.0, 0.02)
-    found.advance()
-    found.update(0.01, 1e-6)
-    assert (found.value, found.sigma) == (0.02, 0.0)
-
-
-def test_one_wild_measurement_moves_it_no_farther_than_three_sigmas() -> None:
-    tame, wild = ConstantFilter(0.1, 5e-4), ConstantFilter(0.1, 5e-4)
-    tame.update(3.0 * np.hypot(0.1, 0.02), 0.02)
-    wild.update(50.0, 0.02)
-    assert wild.value == pytest.approx(tame.value)
+def test_what_is_not_told_stays_at_the_prior() -> None:
+    prior, sigmas = np.array([0.0, 0.3]), np.array([0.1, 0.2])
+    found = ConstantFilter(prior, sigmas)
+    for _ in range(100):
+        found.note(np.diag([1000.0, 0.0]), np.zeros(2), np.zeros(2))
+        found.advance()
+    assert found.mean[1] == pytest.approx(0.3)
+    assert found.covariance[1, 1] == pytest.approx(0.2**2)
+    assert found.covariance[0, 0] < 0.01**2
 
 
 @pytest.mark.parametrize(
@@ -140,63 +126,90 @@ def test_one_misfit_far_off_does_not_undo_what_many_showed() -> None:
 
 
 def test_what_is_noted_counts_from_the_next_frame_and_once() -> None:
-    offsets = RigOffsets(config())
-    offsets.note_disparity(result(disparity_px=0.1).calibration_errors["disparity_px"])
-    offsets.note_rows(0.2)
-    assert offsets.disparity.value == offsets.row.value == 0.0
+    offsets, pixels = RigOffsets(CAMERA, config()), points_in_view(200)[:, :2] * 5.0
+    offsets.note(told({"d0": 0.3}, 0.005, offsets.names))
+    offsets.note_rows(pixels, np.full(200, 0.2))
+    assert not offsets.lens.any()
+    assert not offsets.rows.any()
     offsets.advance()
-    disparity_px, row_px = offsets.disparity.value, offsets.row.value
-    assert 0.0 < disparity_px <= 0.1
-    assert 0.0 < row_px <= 0.2
-    for _ in range(87):
-        offsets.note_rows(0.2)  # measured while less of it was known
+    lens, rows = offsets.lens, offsets.rows
+    assert 0.1 < lens[0] < 0.3
+    assert 0.0 < rows[0] < 0.2
+    offsets.advance()
+    np.testing.assert_allclose(offsets.lens, lens, rtol=1e-2)
+    np.testing.assert_allclose(offsets.rows, rows, rtol=1e-2)
+
+
+def test_rows_are_found_that_change_over_the_image() -> None:
+    rng, offsets = np.random.default_rng(3), RigOffsets(CAMERA, config())
+    for _ in range(60):
+        pixels = rng.uniform([20, 20], [620, 460], (150, 2))
+        shifts = 0.2 + 0.4 * ((pixels[:, 1] - CAMERA.cy) / CAMERA.height) ** 2
+        shifts[::5], shifts[1::5] = np.nan, 1.4  # not told, and of another corner
+        offsets.note_rows(pixels, shifts + 0.05 * rng.normal(size=150))
         offsets.advance()
-        assert row_px <= offsets.row.value <= 0.2
-    assert offsets.row.value == pytest.approx(0.2, abs=0.01)
-    row_px = offsets.row.value
+    places = np.array([[320.0, 240.0], [320.0, 430.0]])
+    expected = 0.2 + 0.4 * ((places[:, 1] - CAMERA.cy) / CAMERA.height) ** 2
+    np.testing.assert_allclose(offsets.row_errors(places), expected, atol=0.03)
+    rows = offsets.rows
+    offsets.note_rows(places, np.array([0.9, 0.9]))  # too few
     offsets.advance()
-    assert (offsets.disparity.value, offsets.row.value) == (disparity_px, row_px)
+    np.testing.assert_allclose(offsets.rows, rows, rtol=1e-2)
 
 
-@pytest.mark.parametrize("true_px", [-0.3, -0.04, 0.0, 0.03, 0.2])
-def test_an_offset_is_taken_off_but_for_what_lenses_and_edges_feign(true_px: float) -> None:
-    offsets = RigOffsets(config())
+@pytest.mark.parametrize(("true_px", "is_told"), [(-0.3, True), (-0.04, False), (0.2, True)])
+def test_an_error_is_taken_off_but_for_what_edges_feign(true_px: float, is_told: bool) -> None:
+    offsets = RigOffsets(CAMERA, config())
     for _ in range(200):
         # What is left of it after the present value was subtracted.
-        left_px = true_px - offsets.disparity_px
-        error = ConstantError(value=left_px, sigma=0.01, effect=np.zeros(6))
-        offsets.note_disparity(error)
+        offsets.note(told({"d0": true_px - offsets.lens[0]}, 0.01, offsets.names))
         offsets.advance()
-    assert offsets.disparity.value == pytest.approx(true_px, abs=0.01)
-    expected_px = np.sign(true_px) * max(abs(true_px) - 0.05, 0.0)
-    assert offsets.disparity_px == pytest.approx(expected_px, abs=0.01)
+    assert offsets.learnt["d0"][0] == pytest.approx(true_px, abs=0.01)
+    expected_px = np.sign(true_px) * (abs(true_px) - 0.05) * is_told
+    assert offsets.lens[0] == pytest.approx(expected_px, abs=0.01)
 
 
-def note_link(offsets: RigOffsets, readout_s: float, *, n_inliers: int = 20) -> None:
-    link = result(n_inliers=n_inliers, readout_s=readout_s)
-    offsets.note_readout(link.calibration_errors["readout_s"], link)
-
-
-def test_each_link_of_a_frame_tells_the_readout_that_was_not_known_when_it_was_made() -> None:
-    offsets = RigOffsets(config())
-    for _ in range(2):
-        note_link(offsets, 0.02)
-    assert offsets.readout.value == 0.0
+@pytest.mark.parametrize(("sigma", "is_told"), [(0.022, True), (0.028, False)])
+def test_what_is_not_significant_is_not_taken_off(sigma: float, is_told: bool) -> None:
+    offsets = RigOffsets(CAMERA, config())
+    offsets.note(told({"d0": 0.3}, sigma, offsets.names))
     offsets.advance()
-    # Both are of the value that was used, not of what the first one made of it.
-    assert 0.01 < offsets.readout.value <= 0.02
-    assert offsets.readout.sigma < 0.014
+    assert offsets.lens.any() == is_told
 
 
-def test_a_registration_with_many_outliers_tells_less_of_the_readout() -> None:
-    sure, doubtful = RigOffsets(config()), RigOffsets(config())
-    note_link(sure, 0.02)
-    note_link(doubtful, 0.02, n_inliers=10)
-    for offsets in (sure, doubtful):
+LEARNT = {"d0": -0.3, "dyy": 0.004, "tx": -4e-3, "ty": 3e-3, "k1": 5e-3, "p1": 4e-4, "p2": -8e-4}
+
+
+def test_errors_of_a_lens_are_those_of_both_images() -> None:
+    """By the model of OpenCV for each image; the tilt is what a small turn makes of a plane."""
+    rng = np.random.default_rng(6)
+    uvd = rng.uniform([50, 50, 2.0], [600, 400, 60.0], (50, 3))
+    K = np.array([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]])
+    camera = replace(CAMERA, fy=525.0)
+    D = np.array([LEARNT["k1"], 0.0, LEARNT["p1"], LEARNT["p2"], 0.0])
+
+    def shown(u: FloatArray, v: FloatArray) -> FloatArray:
+        rays = np.column_stack([(u - 319.5) / 525.0, (v - 239.5) / 525.0, np.ones(len(u))])
+        turned = rays / (1.0 - rays[:, :2] @ [LEARNT["tx"], LEARNT["ty"]])[:, np.newaxis]
+        flat = np.column_stack([turned[:, :2], np.ones(len(u))])
+        return Lens(width=640, height=480, K=K, D=D, model="plumb_bob").project(flat)
+
+    left, right = shown(uvd[:, 0], uvd[:, 1]), shown(uvd[:, 0] - uvd[:, 2], uvd[:, 1])
+    own = LEARNT["d0"] + 525.0 * LEARNT["dyy"] * ((uvd[:, 1] - 239.5) / 525.0) ** 2
+    measured = np.column_stack([left, left[:, 0] - right[:, 0] + own])
+    offsets = RigOffsets(camera, config())
+    for _ in range(2):
+        sigmas = 1e-3 * np.abs([LEARNT.get(name, 0.01) for name in offsets.names])
+        information = np.diag(sigmas**-2)
+        left_over = np.array([LEARNT.get(name, 0.0) for name in offsets.names])
+        left_over[: len(offsets.lens)] -= offsets.lens
+        score = information @ left_over
+        effects = np.zeros((len(sigmas), 6))
+        offsets.note(Constants(information=information, score=score, effects=effects))
         offsets.advance()
-    # Half of the matches: four times the sigma.
-    information = [each.readout.sigma**-2 - 0.03**-2 for each in (sure, doubtful)]
-    assert information[0] == pytest.approx(16.0 * information[1], rel=1e-3)
+    # To second order of the errors; a twentieth of a pixel of them stays.
+    assert np.abs(measured - uvd).max() > 1.0
+    np.testing.assert_allclose(offsets.take_off(measured), uvd, atol=0.1)
 
 
 @pytest.mark.parametrize("kind", ["klt", "descriptor"])
@@ -204,24 +217,22 @@ def test_a_frame_tells_the_readout_once_the_next_step_is_known(kind: str) -> Non
     recording = gvo.SyntheticRecording("turning", "rgbd", n_frames=12, seed=3, readout_ms=25.0)
     settings = Config.model_validate({"frontend": {"kind": kind}})
     frontend: Any = make_frontend(recording.info.camera, settings)
-    readout, poses = frontend.rig_offsets.readout, recording.ground_truth().T_world_frame
+    offsets, poses = frontend.rig_offsets, recording.ground_truth().T_world_frame
     frames, values = [frontend.extract(frame) for frame in frames_of(recording)], []
     for k, (reference, current) in enumerate(pairwise(frames), start=1):
         T = se3.invert(poses[k - 1]) @ poses[k]
         frontend.register(reference, current, MotionPrior(T_predicted=T, T_recent=T))
-        frontend.rig_offsets.advance()
-        values.append(readout.value)
+        offsets.advance()
+        values.append(offsets.readout[0])
         if k == 8:
             T = se3.invert(poses[0]) @ poses[k]
             link = frontend.register(frames[0], current, MotionPrior(T_predicted=T))
             assert isinstance(link, RelativePose)
-            frontend.rig_offsets.advance()
-            assert readout.value == values[-1]
-    # Of the first step no velocity is known.
-    assert values[0] == 0.0
-    error_s = np.abs(np.array(values) - READOUT_S)
-    assert error_s[8] != error_s[7]
-    assert error_s[-1] < (0.0015 if kind == "klt" else 0.01)
+            offsets.advance()
+            assert offsets.readout[0] == values[-1]
+    # Steps tell nothing.
+    assert values[:8] == [0.02] * 8
+    assert abs(values[8] - READOUT_S) < 0.003
 
 
 @pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
@@ -253,19 +264,19 @@ def test_what_is_refused_and_loops_tell_nothing_of_the_camera(
                     found = frontend.register(frames[0], current, MotionPrior(T_predicted=T))
                 assert isinstance(found, Failure) == (also == "refused")
             frontend.rig_offsets.advance()
-        return [frontend.rig_offsets.readout.value, frontend.rig_offsets.disparity.value]
+        return [value for value, _ in frontend.rig_offsets.learnt.values()]
 
     assert learnt("loops") == learnt("refused") == learnt("") != learnt("links")
 
 
 def test_nothing_is_learnt_where_it_is_switched_off() -> None:
-    offsets = RigOffsets(config(12.5, estimate_offset=False))
-    offsets.note_rows(0.2)
+    offsets = RigOffsets(CAMERA, config(12.5, estimate_offset=False))
+    offsets.note_rows(points_in_view(200)[:, :2], np.full(200, 0.2))
     offsets.advance()
     assert not offsets.learnt
     assert offsets.as_json() == {
         "disparity_px": 0.0,
-        "disparity_sigma_px": 0.1,
+        "pixel_px": 0.0,
         "row_px": 0.0,
         "readout_ms": 12.5,
         "readout_sigma_ms": 0.0,
@@ -553,16 +564,18 @@ def test_first_steps_claim_no_more_than_is_known_of_the_readout(seed: int) -> No
     assert np.mean(nees) > 0.1
     offsets = odometry.rig_offsets
     assert offsets is not None
-    assert offsets.readout.sigma < offsets.readout.value < READOUT_S + 2.0 * offsets.readout.sigma
+    value, sigma = offsets.readout
+    assert sigma < value < READOUT_S + 2.0 * sigma
 
 
 @pytest.mark.parametrize("readout_ms", [0.0, 0.5, None])
 def test_a_readout_is_possible_until_it_is_known_to_take_no_time(readout_ms: float | None) -> None:
-    offsets = RigOffsets(config(readout_ms))
+    offsets = RigOffsets(CAMERA, config(readout_ms), is_stereo=False)
     assert (offsets.possible_readout_s > 0.0) == (readout_ms != 0.0)
     for _ in range(100):
-        offsets.readout.update(-offsets.readout.value, 1e-3)
-    offsets.advance()
+        if offsets.names:
+            offsets.note(told({"readout_s": -offsets.readout_s}, 1e-3, offsets.names))
+        offsets.advance()
     if readout_ms is None:
         assert offsets.possible_readout_s == 0.0
 
@@ -573,7 +586,7 @@ def test_a_readout_is_possible_until_it_is_known_to_take_no_time(readout_ms: flo
 def test_a_planted_readout_is_found(sensor: Sensor, planted_ms: float) -> None:
     offsets = shaken(sensor, planted_ms).rig_offsets
     assert offsets is not None
-    found_ms, sigma_ms = 1e3 * offsets.readout.value, 1e3 * offsets.readout.sigma
+    found_ms, sigma_ms = 1e3 * np.array(offsets.readout)
     assert abs(found_ms - planted_ms) < 1.5
     assert abs(found_ms - planted_ms) < 2.5 * sigma_ms
     assert sigma_ms < 1.5
@@ -582,8 +595,8 @@ def test_a_planted_readout_is_found(sensor: Sensor, planted_ms: float) -> None:
 @cache
 def frames(offset_px: float, row_px: int = 0) -> list[StereoFrame]:
     """Return a rendered drive with an error of its disparities, and of its rows."""
-    noise = SensorNoise(max_depth_m=80.0, disparity_offset_px=offset_px)
-    recording = gvo.SyntheticRecording("driving", n_frames=N_FRAMES, seed=3, noise=noise)
+    error = RigError(constants={"d0": offset_px})
+    recording = gvo.SyntheticRecording("driving", n_frames=N_FRAMES, seed=3, rig_error=error)
     found = []
     for frame in gvo.frames(recording, Config()):
         assert not isinstance(frame, FaultyFrame)
@@ -610,19 +623,19 @@ Kind = Literal["klt", "descriptor"]
 def test_a_planted_offset_is_found_within_twenty_frames(kind: Kind, planted_px: float) -> None:
     offsets = learn(frames(planted_px), kind).rig_offsets
     assert offsets is not None
-    assert offsets.disparity.sigma < 0.06
-    # The prior of zero holds back a share of it, the more as rows might be read one by one.
-    assert abs(offsets.disparity.value - planted_px) < 0.03 + 0.4 * abs(planted_px)
+    found_px, sigma_px = offsets.learnt["d0"]
+    assert sigma_px < 0.1
+    assert abs(found_px - planted_px) < 0.03 + 0.4 * abs(planted_px)
 
 
 @pytest.mark.acceptance
 def test_rows_that_differ_are_found() -> None:
     offsets = learn(frames(0.0, row_px=1), "klt").rig_offsets
     assert offsets is not None
-    assert offsets.row.value == pytest.approx(1.0, abs=0.15)
+    assert offsets.rows[0] == pytest.approx(1.0, abs=0.15)
     straight = learn(frames(0.0), "klt").rig_offsets
     assert straight is not None
-    assert abs(straight.row.value) < 0.03
+    assert abs(straight.rows[0]) < 0.03
 
 
 @pytest.mark.acceptance

@@ -1,7 +1,5 @@
 """Matched observations of two frames, by hand-written loops and projections."""
 
-from dataclasses import fields
-
 import numpy as np
 from hypothesis import given
 
@@ -33,22 +31,6 @@ def test_pixels_of_both_frames_become_points_of_their_own_frames(seed: int) -> N
         np.testing.assert_allclose(points, unproject(pixels[index]), rtol=1e-12)
         np.testing.assert_array_equal(getattr(matches, f"{side}_uvd"), pixels[index])
         np.testing.assert_array_equal(getattr(matches, f"{side}_sigmas"), sigmas[index])
-
-
-@given(seed=seeds)
-def test_an_offset_that_is_taken_off_was_in_both_disparities(seed: int) -> None:
-    true = random_correspondences(np.random.default_rng(seed), 7)
-    offset = np.array([0.0, 0.0, 0.4])
-    measured = Correspondences.of_pixels(
-        (true.reference_uvd + offset, true.current_uvd + offset),
-        (true.reference_sigmas, true.current_sigmas),
-        CAMERA,
-    )
-    assert not np.allclose(measured.reference_points, true.reference_points, rtol=1e-3)
-    for name in {field.name for field in fields(Correspondences)} - {"sensitivities", "expected"}:
-        found = getattr(measured.without_offset(0.4, CAMERA), name)
-        np.testing.assert_allclose(found, getattr(true, name), rtol=1e-9)
-    assert measured.without_offset(0.0, CAMERA) is measured
 
 
 def test_matches_pair_what_each_frame_saw() -> None:

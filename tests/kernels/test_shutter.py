@@ -12,6 +12,7 @@ from tests.kernels.matches import PARAMETERS
 VELOCITY = np.array([0.3, -0.5, 0.2, 0.8, -0.4, 1.5])
 READOUT_S = 0.03
 OFFSET = np.array([0.0, 0.0, 0.25])
+LENS = OFFSET[2] * np.eye(11)[0]
 
 
 def random_uvd(n: int) -> FloatArray:
@@ -20,7 +21,7 @@ def random_uvd(n: int) -> FloatArray:
 
 def settled(uvd: FloatArray, readout_s: float = READOUT_S) -> FloatArray:
     found = np.full_like(uvd, 7.0)
-    settle_rows(uvd + OFFSET, OFFSET[2], VELOCITY, readout_s, PARAMETERS, found)
+    settle_rows(uvd + OFFSET, LENS, VELOCITY, readout_s, PARAMETERS, found)
     return found
 
 
@@ -55,7 +56,7 @@ def test_the_middle_row_stays_and_so_does_what_would_come_to_lie_behind() -> Non
         assert unproject(top)[0, 2] == pytest.approx(0.1)
         found = np.empty_like(top)
         forward = np.array([0.0, 0.0, 0.0, 0.0, 0.0, speed])
-        settle_rows(top, 0.0, forward, 2.0, PARAMETERS, found)
+        settle_rows(top, 0.0 * LENS, forward, 2.0, PARAMETERS, found)
         assert np.array_equal(found, top) != is_settled
 
 
@@ -73,7 +74,7 @@ def test_readout_rates_are_derivatives_of_what_is_settled(n: int) -> None:
     uvd = random_uvd(n)
     rates = np.full_like(uvd, 7.0)
     measured = uvd + OFFSET
-    write_readout_rates(measured, OFFSET[2], VELOCITY, PARAMETERS, rates)
+    write_readout_rates(measured, LENS, VELOCITY, PARAMETERS, rates)
     points = unproject(uvd)
     motions = times(uvd)[:, np.newaxis] * rates_of(points)
     expected = [

@@ -165,7 +165,9 @@ def test_disparities_are_followed_by_gauss_newton_steps(n: int, n_steps: int) ->
     (left, right), pixels, starts = searches(rng, n)
     slopes = [1.0, 0.0] - WARP[0] + 0.05 * rng.normal(size=(n, 2))
     found, is_valid, plain = np.full(n, 7.0), np.ones(n, np.bool_), []
-    kernels.follow(left, right, pixels, starts, slopes, 0.3, n_steps, found, is_valid)
+    kernels.follow(
+        left, right, pixels, starts, slopes, np.full(len(pixels), 0.3), n_steps, found, is_valid
+    )
     for (u, v), start, (along, across) in zip(pixels, starts, slopes, strict=True):
         if not has_room(u, v, start):
             plain.append((np.nan, False))
@@ -185,7 +187,9 @@ def test_disparities_are_searched_for_near_predictions(n: int, is_refined: bool)
     rng = np.random.default_rng(n)
     (left, right), pixels, starts = searches(rng, n)
     found, is_valid, plain = np.full(n, 7.0), np.ones(n, np.bool_), []
-    kernels.search_near(left, right, pixels, starts, 0.3, is_refined, found, is_valid)
+    kernels.search_near(
+        left, right, pixels, starts, np.full(len(pixels), 0.3), is_refined, found, is_valid
+    )
     for (u, v), start in zip(pixels, starts, strict=True):
         if not has_room(u, v, start):
             plain.append((np.nan, False))
@@ -281,7 +285,7 @@ def test_corners_are_measured_where_they_match_and_nothing_else_does(
     rivals[9:, 2] = rough[9:] + rng.uniform(3, 8, len(rough[9:]))  # the same minimum, or not
     found, slopes, shifts = np.full(n, 7.0), np.full((n, 2), 7.0), np.full(n, 7.0)
     is_reliable = np.ones(n, np.bool_)
-    given = *images, corners, rough, is_known, rivals, 0.3, is_refined
+    given = *images, corners, rough, is_known, rivals, np.full(n, 0.3), is_refined
     kernels.measure(*given, found, slopes, is_reliable, shifts)
     for k in range(n):
         starts = np.append(rough[k] if is_known[k] else np.nan, rivals[k])
@@ -297,7 +301,7 @@ def test_what_is_unknown_is_not_valid() -> None:
     rng = np.random.default_rng(4)
     images, found, is_valid = pair(rng), np.empty(2), np.ones(2, np.bool_)
     given = np.full((2, 2), 40.0), np.full(2, 14.0), np.array([[np.nan, 0.0], [0.0, np.nan]])
-    kernels.follow(*images, *given, 0.3, 3, found, is_valid)
+    kernels.follow(*images, *given, np.full(2, 0.3), 3, found, is_valid)
     assert not is_valid.any()
-    kernels.follow(*images, *given[:2], np.zeros((2, 2)), np.nan, 3, found, is_valid)
+    kernels.follow(*images, *given[:2], np.zeros((2, 2)), np.full(2, np.nan), 3, found, is_valid)
     assert not is_valid.any()

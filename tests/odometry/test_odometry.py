@@ -494,7 +494,7 @@ class CautiousFrontend(ScanFrontend):
     def __init__(self, *, is_learning: bool) -> None:
         super().__init__()
         if is_learning:
-            self.rig_offsets = RigOffsets(Config())
+            self.rig_offsets = RigOffsets(CAMERA, Config())
 
     def register(
         self, reference: Scan, current: Scan, prior: MotionPrior | None

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from gvo.config import Config
 from gvo.frontend.descriptor import DescriptorFrontend
 from gvo.frontend.klt import KltFrontend
-from gvo.frontend.offsets import OFFSET_SIGMA_PX
 from gvo.io.frames import frames
 from gvo.io.recording import Sensor
 from gvo.io.synthetic import SyntheticRecording
@@ -155,17 +154,17 @@ def test_what_is_learnt_stays_until_its_sections_change(kind: str, section: dict
         odometry.track(frame)
     learnt = odometry.rig_offsets
     assert learnt is not None
-    before_px = learnt.disparity.sigma
+    before = [sigma for _, sigma in learnt.learnt.values()]
     odometry.reconfigure(change(config, ransac={"n_hypotheses": 64}, klt={"n_corners": 200}))
     odometry.track(recorded("stereo")[4])
     assert odometry.rig_offsets is learnt
-    assert learnt.disparity.sigma < before_px
+    assert [sigma for _, sigma in learnt.learnt.values()] != before
     odometry.reconfigure(change(config, **section))
     odometry.track(recorded("stereo")[5])
     renewed = odometry.rig_offsets
     assert renewed is not None
-    assert renewed.disparity.sigma == OFFSET_SIGMA_PX
-    assert renewed.readout.value == pytest.approx(0.009 if "camera" in section else 0.0)
+    assert [value for value, _ in renewed.learnt.values()] == [0.0] * len(renewed.learnt)
+    assert renewed.readout[0] == pytest.approx(0.009 if "camera" in section else 0.0)
 
 
 def test_what_an_rgbd_camera_taught_outlasts_a_change_of_stereo() -> None:

@@ -26,7 +26,7 @@ _N_FRAMES = 30
 # Images of a stream may come so much later than those of the other.
 _DELAY_NS = 1_000_000_000
 # A readout of a larger sigma is not told.
-_MAX_SIGMA_MS = 2.5
+_MAX_SIGMA_MS = 4.0
 # A given readout is wrong if it differs by more sigmas, and by more milliseconds, than these.
 _N_SIGMAS = 3.0
 _MIN_DIFFERENCE_MS = 2.0
@@ -109,7 +109,7 @@ def _learn(
         if part is not None:
             runs[part].track(frame)
     readouts = [run.rig_offsets.readout for run in runs if run.rig_offsets is not None]
-    return [(1e3 * each.value, 1e3 * each.sigma) for each in readouts]
+    return [(1e3 * value, 1e3 * sigma) for value, sigma in readouts]
 
 
 def _part_of(stamp_ns: int, parts: Sequence[tuple[int, int]]) -> int | None:

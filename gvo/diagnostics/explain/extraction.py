@@ -70,23 +70,23 @@ def _sort_corners(
 ) -> Sorting:
     halves = halve(frame.left), halve(frame.right)
     pixels = detect_corners(frame.left, config.klt.n_corners, half=halves[0])
-    row_px = offsets.row.value
+    row_offsets_px = offsets.row_errors(pixels)
     found = measure_corners(
         (frame.left, frame.right),
         halves,
         pixels,
         config.stereo,
         max_disparity=float(camera.depth_to_disparity(config.stereo.min_depth_m)),
-        row_offset_px=row_px,
+        row_offsets_px=row_offsets_px,
     )
     disparities = found.disparities
-    corrected = disparities - offsets.disparity_px
+    corrected = offsets.take_off(np.column_stack([pixels, disparities]))[:, 2]
     tests = {
         "not found along the row": np.isfinite(disparities),
         "left and right unlike": found.are_reliable,
         "depth out of range": is_in_depth_range(corrected, camera, config.stereo),
     }
-    partners = np.column_stack([pixels[:, 0] - disparities, pixels[:, 1] + row_px])
+    partners = np.column_stack([pixels[:, 0] - disparities, pixels[:, 1] + row_offsets_px])
     return Sorting(tests=tests, pixels=pixels, partners=partners, values=disparities)
 
 
@@ -100,7 +100,8 @@ def _sort_matches(
     pairs, n = match_stereo(left, right, camera, stereo), len(left)
     ends = left.keypoints[pairs[:, 0]], right.keypoints[pairs[:, 1]]
     found, is_fitted = refine_disparities((frame.left, frame.right), *ends, stereo)
-    is_in_range = is_fitted & is_in_depth_range(found - offsets.disparity_px, camera, stereo)
+    ideal = offsets.take_off(np.column_stack([ends[0], found]))
+    is_in_range = is_fitted & is_in_depth_range(ideal[:, 2], camera, stereo)
     tests = {
         "no keypoint on its row in range": as_mask(in_range[:, 0], n),
         "octave": as_mask(tried[0][:, 0], n),

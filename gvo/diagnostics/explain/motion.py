@@ -164,8 +164,7 @@ def _find_motion(
         T_start = prior.T_predicted
     stamps_ns = measured.frames[0].stamp_ns, measured.frames[1].stamp_ns
     consensus = find_consensus(matches, camera, config, stamps_ns, T_start)
-    offset = [0.0, 0.0, frontend.rig_offsets.disparity_px]
-    moved = np.abs(matches.current_uvd - (measured.uvd[1] - offset))
+    moved = np.abs(matches.current_uvd - frontend.rig_offsets.take_off(measured.uvd[1]))
     motion: dict[str, Any] = {
         "n_consensus": 0,
         "is_known": False,

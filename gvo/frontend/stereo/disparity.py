@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from statistics import median
 from typing import Any
 
 import numpy as np
@@ -14,8 +13,6 @@ from gvo.frontend.tracking import halve
 from gvo.kernels import stereo
 from gvo.types import BoolArray, FloatArray, ImageArray
 
-# Number of corners that the row offset is measured with, at least.
-_MIN_ROW_SHIFTS = 50
 # A row offset of one corner that is more than this is another one, pixels.
 _MAX_ROW_SHIFT_PX = 1.5
 
@@ -32,14 +29,14 @@ class CornerDisparities:
         Change of the reliable ones per pixel, along rows and columns.
     are_reliable : ndarray of bool, shape (n,)
         Left and right match there, and nowhere else along the row.
-    row_shift_px : float or None
-        Remaining row offset of the right image; None from too few patches.
+    row_shifts_px : ndarray of float64, shape (n,)
+        By how much rows of the right image are larger beyond that; NaN where not measured.
     """
 
     disparities: FloatArray
     slopes: FloatArray
     are_reliable: BoolArray
-    row_shift_px: float | None
+    row_shifts_px: FloatArray
 
 
 def measure_corners(
@@ -49,7 +46,7 @@ def measure_corners(
     config: StereoConfig,
     *,
     max_disparity: float,
-    row_offset_px: float = 0.0,
+    row_offsets_px: FloatArray,
 ) -> CornerDisparities:
     """Search for corners of the left image along the whole row, and measure their disparities.
 
@@ -65,8 +62,8 @@ def measure_corners(
         Sub-pixel steps or none.
     max_disparity : float
         Pixels.
-    row_offset_px : float
-        By how much rows of the right image are larger.
+    row_offsets_px : ndarray of float64, shape (n,)
+        By how much rows of the right image are larger there.
 
     Returns
     -------
@@ -77,15 +74,15 @@ def measure_corners(
     disparities, slopes, row_shifts = np.empty(n), np.empty((n, 2)), np.empty(n)
     are_reliable = np.empty(n, np.bool_)
     stereo.measure(
-        *(*_contiguous(*images, corners), *rough, row_offset_px, config.subpixel != "none"),
+        *(*_contiguous(*images, corners), *rough, row_offsets_px, config.subpixel != "none"),
         *(disparities, slopes, are_reliable, row_shifts),
     )
-    told = row_shifts[np.abs(row_shifts) < _MAX_ROW_SHIFT_PX]
+    row_shifts[np.abs(row_shifts) > _MAX_ROW_SHIFT_PX] = np.nan
     return CornerDisparities(
         disparities=disparities,
         slopes=slopes,
         are_reliable=are_reliable,
-        row_shift_px=median(told.tolist()) if len(told) >= _MIN_ROW_SHIFTS else None,
+        row_shifts_px=row_shifts,
     )
 
 
@@ -125,7 +122,7 @@ def measure_disparities(
     predicted: FloatArray,
     config: StereoConfig,
     *,
-    row_offset_px: float = 0.0,
+    row_offsets_px: FloatArray,
 ) -> tuple[FloatArray, BoolArray]:
     """Measure the disparities of pixels near predicted ones, to a fraction of a pixel.
 
@@ -142,8 +139,8 @@ def measure_disparities(
         Pixels, right to three.
     config : StereoConfig
         Sub-pixel steps or none.
-    row_offset_px : float
-        Row offset of the right image.
+    row_offsets_px : ndarray of float64, shape (n,)
+        By how much rows of the right image are larger there.
 
     Returns
     -------
@@ -153,7 +150,7 @@ def measure_disparities(
     """
     disparities, is_valid = np.empty(len(pixels)), np.empty(len(pixels), np.bool_)
     is_refined = config.subpixel != "none"
-    given = *_contiguous(*images, pixels, predicted), row_offset_px, is_refined
+    given = *_contiguous(*images, pixels, predicted), row_offsets_px, is_refined
     stereo.search_near(*given, disparities, is_valid)
     return disparities, is_valid
 
@@ -166,7 +163,7 @@ def follow_disparities(
     *,
     n_steps: int,
     slopes: FloatArray,
-    row_offset_px: float = 0.0,
+    row_offsets_px: FloatArray,
 ) -> tuple[FloatArray, BoolArray]:
     """Measure the disparities of pixels from predictions that are right to a pixel or two.
 
@@ -175,9 +172,9 @@ def follow_disparities(
     the surfaces: patches of the right image are sampled so.
     """
     if config.subpixel == "none":
-        return measure_disparities(images, pixels, predicted, config, row_offset_px=row_offset_px)
+        return measure_disparities(images, pixels, predicted, config, row_offsets_px=row_offsets_px)
     disparities, is_valid = np.empty(len(pixels)), np.empty(len(pixels), np.bool_)
-    given = *_contiguous(*images, pixels, predicted, slopes), row_offset_px, n_steps
+    given = *_contiguous(*images, pixels, predicted, slopes), row_offsets_px, n_steps
     stereo.follow(*given, disparities, is_valid)
     return disparities, is_valid
 

@@ -12,7 +12,7 @@ _REST_M = 0.05
 # Sigmas that are right within this factor fit.
 _FIT_FACTOR = 2.0
 # What was learnt of a camera is told from here on, and where it is more than three sigmas.
-_OFFSET_PX = 0.1
+_DISPARITY_PX, _ROW_PX = 1.0, 0.5
 _READOUT_MS = 5.0
 # A scale is wrong that is off by more than this, and without which so much of the ATE is left.
 _SCALE, _SCALED_SHARE = 0.02, 0.4
@@ -147,13 +147,19 @@ def _looks_at_frames(summary: Mapping[str, Any]) -> list[str]:
 
 def _looks_at_camera(offsets: Mapping[str, Any]) -> list[str]:
     found = []
-    disparity, row = offsets.get("disparity_px") or 0.0, offsets.get("row_px") or 0.0
-    sigma, readout = offsets.get("disparity_sigma_px") or 0.0, offsets.get("readout_ms") or 0.0
-    if abs(disparity) > max(_OFFSET_PX, 3.0 * sigma):
-        size = "large" if disparity > 0.0 else "small"
-        found.append(f"the calibration, disparities are {abs(disparity):.2g} px too {size}")
-    if abs(row) > 2.0 * _OFFSET_PX:
-        found.append(f"the rectification, rows of the right image are off by {abs(row):.2g} px")
+    disparity, row, pixel, readout = (
+        offsets.get(name) or 0.0 for name in ("disparity_px", "row_px", "pixel_px", "readout_ms")
+    )
+    if disparity > _DISPARITY_PX:
+        found.append(
+            f"the calibration, disparities are off by up to {disparity:.2g} px, pixels by "
+            f"{pixel:.2g}: calibrate anew"
+        )
+    if row > _ROW_PX:
+        found.append(
+            f"the rectification, rows of the right image are off by up to {row:.2g} px: "
+            "calibrate anew"
+        )
     sigma = offsets.get("readout_sigma_ms") or 0.0
     if sigma and abs(readout) > max(_READOUT_MS, 3.0 * sigma):
         found.append(f"a rolling shutter, rows are read out over {readout:.2g} ms")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import partial
 from typing import Any, get_args
 
@@ -14,6 +13,7 @@ from gvo.geometry.camera import Calibration, PinholeCamera
 from gvo.geometry.se3 import invert, make_transform
 from gvo.io.recording import RecordingInfo, Sensor, StampedImage, shown
 from gvo.io.synthetic.rendering import scale_camera, to_uint8
+from gvo.io.synthetic.rig_error import BentRig, RigError
 from gvo.io.synthetic.sensor import SensorNoise, expose, spoil_depth
 from gvo.io.synthetic.world import WORLDS, World, WorldName
 from gvo.trajectory.trajectory import Trajectory
@@ -52,6 +52,9 @@ class SyntheticRecording:
         of a stereo camera; stamps and ground truth are those of the middle row. Depth is
         registered to the colour image without error, along the axis of the row's pose. What
         moves in a world stands still during the readout. 0: all rows at once.
+    rig_error : RigError, optional
+        Images, and depth, are those of a rig that differs from the ideal one, whose calibration
+        and ground truth are given.
 
     Raises
     ------
@@ -75,6 +78,7 @@ class SyntheticRecording:
         scale: float = 1.0,
         noise: SensorNoise | None = None,
         readout_ms: float = 0.0,
+        rig_error: RigError | None = None,
     ) -> None:
         _check(world, sensor, n_frames, seed, scale)
         self._world = world if isinstance(world, World) else WORLDS[world]
@@ -89,6 +93,10 @@ class SyntheticRecording:
         self._move = self._world.motion(seed)
         self._T_map_cam = self._move(np.asarray(1e-9 * self._elapsed_ns, dtype=np.float64))
         self._scene = self._world.scene(seed)
+        self._bent = None
+        if rig_error is not None:
+            constants = rig_error.draw(self._camera, is_stereo=sensor == "stereo")
+            self._bent = BentRig(self._camera, self._world.baseline_m, constants)
 
     @property
     def info(self) -> RecordingInfo:
@@ -149,8 +157,7 @@ class SyntheticRecording:
         if stream == 0 or self._sensor == "rgbd":
             return T_map_cam, self._camera
         T_left_right = make_transform(np.eye(3), np.array([self._world.baseline_m, 0.0, 0.0]))
-        shifted = replace(self._camera, cx=self._camera.cx - self._noise.disparity_offset_px)
-        return T_map_cam @ T_left_right, shifted
+        return T_map_cam @ T_left_right, self._camera
 
     def _poses(self, index: int) -> FloatArray:
         """Return the pose of a frame, shape (4, 4), or those of its rows, (height, 4, 4)."""
@@ -162,11 +169,15 @@ class SyntheticRecording:
 
     def _load(self, index: int, stream: int) -> NDArray[Any]:
         rng = np.random.default_rng([self._seed, index, stream])
+        bent = self._bent
         if stream == 1 and self._sensor == "rgbd":
-            return spoil_depth(self.render_depth(index), self._noise, rng)
+            depth = self.render_depth(index)
+            return spoil_depth(depth if bent is None else bent.bend_depth(depth), self._noise, rng)
         T_map_cam, camera = self._view(index, stream)
         elapsed_s = self._elapsed_s(index)
         grey = self._scene.image(elapsed_s, T_map_cam, camera)
+        if bent is not None:
+            grey = bent.bend(grey, self.render_depth(index, 1) if stream == 1 else None)
         return to_uint8(expose(grey, self._noise, rng, stream=stream, elapsed_s=elapsed_s))
 
 

@@ -27,8 +27,6 @@ class SensorNoise:
         Amplitude of the brightness that comes and goes within seconds, relative.
     exposure_mismatch : float
         How much brighter the right image is, relative.
-    disparity_offset_px : float
-        An error of the calibration: every disparity is larger by so much, pixels.
     depth_sigma : float
         Gaussian noise of the inverse depth, 1/m: sigma_z = depth_sigma * z^2.
     depth_step : float
@@ -49,7 +47,6 @@ class SensorNoise:
     grey_sigma: float = 2.0
     exposure_drift: float = 0.05
     exposure_mismatch: float = 0.02
-    disparity_offset_px: float = 0.0
     depth_sigma: float = 0.0014
     depth_step: float = 0.002
     hole_share: float = 0.02

@@ -131,8 +131,8 @@ def test_the_offsets_of_the_rig_are_those_that_the_frame_was_measured_with() -> 
     # What the last frame taught takes effect with the next one.
     offsets, explanation = odometry.rig_offsets, explained("klt", "stereo")
     assert offsets is not None
-    assert explanation.offset_px == offsets.disparity_px
-    assert explanation.row_offset_px == offsets.row.value != 0.0
+    assert explanation.offset_px == offsets.lens[0]
+    assert explanation.row_offset_px == offsets.rows[0] != 0.0
     assert explanation.readout_ms == 1e3 * offsets.readout_s
 
 

@@ -29,7 +29,12 @@ def measure(
 ) -> CornerDisparities:
     chosen = grid() if corners is None else corners
     return measure_corners(
-        images, halved(images), chosen, config, max_disparity=40.0, row_offset_px=row_offset_px
+        images,
+        halved(images),
+        chosen,
+        config,
+        max_disparity=40.0,
+        row_offsets_px=np.full(len(chosen), row_offset_px),
     )
 
 
@@ -80,7 +85,7 @@ def test_nothing_is_measured_in_flat_images() -> None:
     found = measure((flat, flat))
     assert not found.are_reliable.any()
     assert np.isnan(found.disparities).all()
-    assert found.row_shift_px is None
+    assert np.isnan(found.row_shifts_px).all()
 
 
 @pytest.mark.parametrize("shape", [(3, 3), (12, 200), (200, 12), (40, 40)])
@@ -127,7 +132,10 @@ def test_a_copy_is_found_behind_what_only_resembles_it() -> None:
     assert np.all(np.abs(rough - 8.0) < COARSE_ERROR_PX)
     assert copied[:, 1:].any()
     assert copied.any(axis=1).all()
-    found = measure_corners((left, right), halves, corners, CONFIG, max_disparity=160.0)
+    rows = np.zeros(len(corners))
+    found = measure_corners(
+        (left, right), halves, corners, CONFIG, max_disparity=160.0, row_offsets_px=rows
+    )
     assert not found.are_reliable.any()
 
 
@@ -144,15 +152,8 @@ def test_corners_across_a_step_of_depth_are_not_reliable() -> None:
 def test_rows_that_differ_are_measured_and_taken_off(shift: float) -> None:
     images, known = (image(), image(-7.3, shift)), 0.0
     for _ in range(3):
-        left = measure(images, row_offset_px=known).row_shift_px
-        assert left is not None
-        known += left
+        known += float(np.nanmedian(measure(images, row_offset_px=known).row_shifts_px))
     assert known == pytest.approx(shift, abs=0.03)
-
-
-def test_few_patches_say_nothing_of_rows() -> None:
-    assert measure((image(), image(-7.3)), grid()[:20]).row_shift_px is None
-    assert measure((image(), image(-7.3)), grid()).row_shift_px is not None
 
 
 def pair(disparity: FloatArray | float) -> tuple[ImageArray, ImageArray]:

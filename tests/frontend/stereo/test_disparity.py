@@ -9,13 +9,29 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gvo.config import StereoConfig
-from gvo.frontend.stereo.disparity import follow_disparities, measure_disparities
-from gvo.types import FloatArray, ImageArray
+from gvo.frontend.stereo import disparity as stereo
+from gvo.types import BoolArray, FloatArray, ImageArray
 from tests.frontend.analytic import MIDDLE, SHAPE, grid, image, slanted_pair
 
 CONFIG = StereoConfig()
 FACING = np.zeros((len(grid()), 2))
 STEPS: dict[str, Any] = {"n_steps": 3, "slopes": FACING}
+
+
+def measure_disparities(
+    images: tuple[ImageArray, ImageArray], pixels: FloatArray, *given: Any
+) -> tuple[FloatArray, BoolArray]:
+    """Measure where rows of both images are alike."""
+    rows = np.zeros(len(pixels))
+    return stereo.measure_disparities(images, pixels, *given, row_offsets_px=rows)
+
+
+def follow_disparities(
+    images: tuple[ImageArray, ImageArray], pixels: FloatArray, *given: Any, **options: Any
+) -> tuple[FloatArray, BoolArray]:
+    """Follow where rows of both images are alike."""
+    rows = np.zeros(len(pixels))
+    return stereo.follow_disparities(images, pixels, *given, row_offsets_px=rows, **options)
 
 
 def pair(disparity: FloatArray | float, **right: float) -> tuple[ImageArray, ImageArray]:

@@ -16,6 +16,7 @@ from gvo.io.recording import Source
 from gvo.io.synthetic import (
     Light,
     Rectangle,
+    RigError,
     SensorNoise,
     StillScene,
     SyntheticRecording,
@@ -102,8 +103,7 @@ def residual_disparities(
 
 @pytest.mark.parametrize("offset", [-0.5, 0.4])
 def test_a_planted_offset_makes_every_disparity_larger(offset: float) -> None:
-    noise = replace(PERFECT, disparity_offset_px=offset)
-    recording = perfect("handheld", n_frames=2, noise=noise)
+    recording = perfect("handheld", n_frames=2, rig_error=RigError(constants={"d0": offset}))
     assert recording.info.camera == perfect("handheld", n_frames=2).info.camera
     assert abs(np.mean(residual_disparities(*right_seen_from_left(recording, 0, offset)))) < 0.02
 
