@@ -69,7 +69,11 @@ def batch(
     found = find_recordings(asked)
     files_from_anywhere = tuple(path.absolute() for path in paths_of(options.calibration))
     batch_options = BatchOptions(
-        recording=replace(options, calibration=files_from_anywhere),
+        recording=replace(
+            options,
+            calibration=files_from_anywhere,
+            rig=None if options.rig is None else Path(options.rig).absolute(),
+        ),
         excerpt=excerpt,
         report=with_report,
         force=force,

@@ -182,6 +182,7 @@ def _wait(
 ) -> tuple[Source, BaseFrame]:
     """Wait for the topics of a camera and its calibration; return it with its base frame."""
     from gvo.io.poses.base_frame import find_base_frame
+    from gvo.io.rig_file import with_rig
     from gvo.live.topics import NetworkReader, TopicSource, wait_for
 
     reader = NetworkReader(cast("Transport", network))
@@ -189,6 +190,7 @@ def _wait(
     def find() -> tuple[Source, BaseFrame]:
         calibration = options.calibration
         source = TopicSource(reader, topics=options, calibration=calibration, config=config)
+        source.info = with_rig(source.info, options.rig)
         return source, find_base_frame(source, frame)
 
     found = wait_for(find, _say, has_signal)
@@ -205,6 +207,7 @@ def _own_camera(
     from gvo.io.calibration.files import paths_of
     from gvo.io.frames import Rig
     from gvo.io.opening import refuse_topics
+    from gvo.io.rig_file import with_rig
     from gvo.live.sources import Device, StandardInput
 
     refuse_topics(options, "camera" if names else "-")
@@ -212,10 +215,11 @@ def _own_camera(
     if not 1 <= len(files) <= 2:
         raise ConfigurationError(f"expected one or two --calibration, got {len(files)}")
     rig = Rig(*files, sensor=sensor, is_rectified=is_rectified)
+    info = with_rig(rig.info, options.rig)
     if names:
-        return Device(names, rig.info)
+        return Device(names, info)
     number, scale = sys.stdin.fileno(), rig.depth_scale
-    return StandardInput(rig.info, config, depth_scale=scale, number=number)
+    return StandardInput(info, config, depth_scale=scale, number=number)
 
 
 def _status(odometry: LiveOdometry) -> Callable[[Progress], None]:

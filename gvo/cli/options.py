@@ -129,6 +129,10 @@ def _recording_options(
             "KITTI that replaces the recording's own. May be repeated.",
         ),
     ] = None,
+    rig: Annotated[
+        Path | None,
+        Option(metavar="FILE", help="The rig.yaml of an earlier run with the same camera."),
+    ] = None,
     left: Annotated[str | None, _topic("the left images")] = None,
     right: Annotated[str | None, _topic("the right images")] = None,
     color: Annotated[str | None, _topic("the colour images")] = None,
@@ -141,7 +145,10 @@ def _recording_options(
 
     topics: dict[str, Any] = {"left": left, "right": right, "color": color, "depth": depth}
     return RecordingOptions(
-        calibration=tuple(calibration or ()), camera_info=tuple(camera_info or ()), **topics
+        calibration=tuple(calibration or ()),
+        rig=rig,
+        camera_info=tuple(camera_info or ()),
+        **topics,
     )
 
 

@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from gvo.config import Config
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.refinement import Constants
+from gvo.geometry.rig import LENS, READOUT, ROWS, LearntRig
 from gvo.kernels import lens as kernels
 from gvo.types import FloatArray
 
 # Largest inflation of the sigmas of a registration by tracks: errors of near ones correlate.
 KLT_SIGMA_FACTOR = 2.4
-LENS = "d0", "dx", "dy", "dxx", "dxy", "dyy", "tx", "ty", "k1", "p1", "p2"
-"""Constants of pixels and disparities, see `gvo.kernels.lens`."""
-ROWS = "r0", "rx", "ry", "rxx", "rxy", "ryy"
-"""Constants of the rows of the right image."""
-READOUT = "readout_s"
 # By how many pixels what is seen anywhere in the image may be off: sigmas for each constant of the
 # disparities, of the lens, and of the rows.
 _DISPARITY_PRIOR_PX = 0.5
-_LENS_PRIOR_PX = 1.5
+_LENS_PRIOR_PX = 1.0
 _ROW_PRIOR_PX = 1.0
 # Mean and sigma of the readout time of RGB-D cameras, whose shutters roll, and of stereo cameras,
 # whose shutters hardly do, seconds.
@@ -39,6 +37,8 @@ _GATE = 4.0
 _FEIGNED_PX = 0.05
 # Frames over which what was learnt is forgotten: temperature, vibration.
 _N_LASTING = 3000
+# Share of what earlier runs told that counts: the same images must not count twice.
+_KEPT = 0.25
 # Sigma of the row of one corner, and beyond which it tells less, pixels; steps of that.
 _ROW_SIGMA_PX = 0.5
 _ROW_KERNEL_PX = 0.15
@@ -57,39 +57,74 @@ class ConstantFilter:
 
     Parameters
     ----------
-    mean, sigmas : ndarray of float64, shape (k,)
-        Of the prior.
+    presumed : mapping of str to (float, float)
+        Mean and standard deviation of each of the k constants.
+    rig : LearntRig, optional
+        What earlier runs learnt: means, where it has them, and some of its information.
 
     Attributes
     ----------
     mean : ndarray of float64, shape (k,)
         What was learnt.
-    covariance, information : ndarray of float64, shape (k, k)
+    covariance : ndarray of float64, shape (k, k)
         Of that.
     """
 
-    def __init__(self, mean: FloatArray, sigmas: FloatArray) -> None:
-        self.mean, self.covariance = mean, np.diag(sigmas**2)
-        self.information = self._prior = np.diag(sigmas**-2)
-        self._prior_vector = self._prior @ mean
-        self._told, self._vector = np.zeros_like(self._prior), np.zeros_like(mean)
+    def __init__(
+        self, presumed: Mapping[str, tuple[float, float]], rig: LearntRig | None = None
+    ) -> None:
+        self.names = (*presumed,)
+        self.mean, sigmas = np.reshape([*presumed.values()], (-1, 2)).T
+        self._prior = self._presumed = np.diag(sigmas**-2)
+        self._prior_vector = self._prior @ self.mean
+        if rig is not None:
+            values, information = rig.of(self.names)
+            self._prior = self._presumed + _KEPT * information
+            self._prior_vector = self._prior_vector + _KEPT * information @ values
+        self._told, self._vector = np.zeros_like(self._prior), np.zeros_like(self.mean)
+        self.advance()
 
-    def note(self, information: FloatArray, score: FloatArray, used: FloatArray) -> None:
-        """Take normal equations of what is left of the constants, after some were used."""
-        self._told += information / _FACTOR**2
-        self._vector += (information @ used + score) / _FACTOR**2
+    @property
+    def told(self) -> FloatArray:
+        """The information of images, shape (k, k), those of earlier runs with their share."""
+        return self._prior + self._told - self._presumed
+
+    @property
+    def learnt(self) -> dict[str, tuple[float, float]]:
+        """Mean and standard deviation by name."""
+        sigmas = np.sqrt(np.diag(self.covariance)).tolist()
+        return dict(zip(self.names, zip(self.mean.tolist(), sigmas, strict=True), strict=True))
+
+    def of(self, names: tuple[str, ...]) -> tuple[FloatArray, FloatArray]:
+        """Return the means (k,) and the covariance (k, k) of some constants."""
+        places = self._places(names)
+        return self.mean[places], self.covariance[np.ix_(places, places)]
+
+    def _places(self, names: tuple[str, ...]) -> list[int]:
+        return [self.names.index(name) for name in names]
+
+    def note(
+        self,
+        names: tuple[str, ...],
+        information: FloatArray,
+        score: FloatArray,
+        used: FloatArray,
+    ) -> None:
+        """Take normal equations of what is left of some constants, after some were used."""
+        places = self._places(names)
+        self._told[np.ix_(places, places)] += information / _FACTOR**2
+        self._vector[places] += (information @ used + score) / _FACTOR**2
 
     def advance(self) -> None:
         """Solve for all that was noted, and forget a little of it."""
-        self.information = self._prior + self._told
-        self.covariance = np.asarray(np.linalg.inv(self.information))
+        self.covariance = np.asarray(np.linalg.inv(self._prior + self._told))
         self.mean = np.asarray(self.covariance @ (self._prior_vector + self._vector))
         self._told *= 1.0 - 1.0 / _N_LASTING
         self._vector *= 1.0 - 1.0 / _N_LASTING
 
-    def significance(self, chosen: slice) -> float:
+    def significance(self, names: tuple[str, ...]) -> float:
         """Return how far some constants are from zero, in sigmas."""
-        mean, covariance = self.mean[chosen], self.covariance[chosen, chosen]
+        mean, covariance = self.of(names)
         return math.sqrt(mean @ np.linalg.solve(covariance, mean))
 
 
@@ -142,9 +177,10 @@ class RigOffsets:
     Parameters
     ----------
     camera : StereoCamera
+        With what was learnt of it before, if anything.
     config : Config
-        `stereo.estimate_offset`, else lens and rows stay as they are; `camera.readout_ms`, known or
-        to be learnt.
+        `stereo.estimate_offset`, else lens and rows stay as they were learnt before, and the
+        readout, too; `camera.readout_ms`, known or to be learnt.
     is_stereo : bool
         Of other sensors, whose depth is not that of their lens, the readout time alone is learnt.
 
@@ -162,69 +198,84 @@ class RigOffsets:
         The readout time as learnt or given, seconds, and its standard deviation.
     possible_readout_s : float
         How long the readout may be, seconds: zero where it is known to take no time.
+    waiting : list
+        Links of the newest frame, which tell of the camera once the step after it is known.
     chain_factor, window_factor : VarianceFactor
         Of the covariances of registrations where they are chained, and where they are smoothed:
         by loops of links and steps, and by the edges of one frame in the window.
     """
 
     def __init__(self, camera: StereoCamera, config: Config, *, is_stereo: bool = True) -> None:
-        self._is_stereo = is_stereo
+        self._is_stereo, self._camera, self._rig = is_stereo, camera, camera.rig
         self._learns_lens = is_stereo and config.stereo.estimate_offset
+        # What was learnt before is held where lens and rows are not to be learnt.
+        self._held: Mapping[str, tuple[float, float]] = {}
+        if self._rig is not None and is_stereo and not self._learns_lens:
+            self._held = self._rig.constants
         u, v = np.meshgrid(np.linspace(0, camera.width, 17), np.linspace(0, camera.height, 9))
         self._places = np.column_stack([u.ravel(), v.ravel(), np.zeros(u.size)])
-        self._camera = camera
         self._grid = self.lens_fields(self._places)
         self._readout_ms = config.camera.readout_ms
         self.lens, self.rows = np.zeros(len(LENS)), np.zeros(len(ROWS))
         self.readout = (1e-3 * (self._readout_ms or 0.0), 0.0)
-        mean, sigmas, row_sigmas = [], [], np.ones(len(ROWS))
-        if self._learns_lens:
-            reach = np.linalg.norm(self._grid, axis=2).max(axis=1)
-            prior_px = [_DISPARITY_PRIOR_PX if name[0] == "d" else _LENS_PRIOR_PX for name in LENS]
-            mean, sigmas = [0.0] * len(LENS), [*(prior_px / reach)]
-            row_sigmas = _ROW_PRIOR_PX / np.abs(self._row_fields(self._places)).max(axis=1)
-        if self._readout_ms is None:
-            known, sigma = _READOUT_STEREO_S if self._is_stereo else _READOUT_RGBD_S
-            mean, sigmas = [*mean, known], [*sigmas, sigma]
-        self._constants = ConstantFilter(np.array(mean), np.array(sigmas))
-        self._rows = ConstantFilter(np.zeros(len(ROWS)), row_sigmas)
+        self._filter = ConstantFilter(self._presume(), self._rig)
+        # What was significant is so with a share of its information.
+        self._gate = _GATE * math.sqrt(1.0 if self._rig is None else _KEPT)
+        self._n_frames = 0
+        self.waiting: list[Any] = []
+        if self._rig is not None and self._held:
+            self.lens, self.rows = (self._rig.of(names)[0] for names in (LENS, ROWS))
         self._sigma_factor = math.nan
         self.reconfigure(config)
         self._settle()
 
+    def _presume(self) -> dict[str, tuple[float, float]]:
+        """Return mean and sigma of all that is to be learnt."""
+        presumed = {}
+        if self._learns_lens:
+            reach = np.linalg.norm(self._grid, axis=2).max(axis=1)
+            for name, reach_px in zip(LENS, reach.tolist(), strict=True):
+                prior_px = _DISPARITY_PRIOR_PX if name[0] == "d" else _LENS_PRIOR_PX
+                presumed[name] = 0.0, prior_px / reach_px
+            reach = np.abs(self._row_fields(self._places)).max(axis=1)
+            for name, reach_px in zip(ROWS, reach.tolist(), strict=True):
+                presumed[name] = 0.0, _ROW_PRIOR_PX / reach_px
+        if self._readout_ms is None:
+            presumed[READOUT] = _READOUT_STEREO_S if self._is_stereo else _READOUT_RGBD_S
+        return presumed
+
     @property
     def names(self) -> tuple[str, ...]:
         """The constants that registrations tell, in this order."""
-        lens = LENS if self._learns_lens else ()
-        return lens if self._readout_ms is not None else (*lens, READOUT)
+        return tuple(name for name in self._filter.names if name not in ROWS)
 
     @property
-    def learnt(self) -> dict[str, tuple[float, float]]:
-        """What was learnt by name, rows of the right image besides, and its standard deviation."""
-        filters = [(self.names, self._constants), (ROWS if self._learns_lens else (), self._rows)]
-        return {
-            name: (float(value), math.sqrt(variance))
-            for names, learnt in filters
-            for name, value, variance in zip(
-                names, learnt.mean, np.diag(learnt.covariance), strict=False
-            )
-        }
+    def learnt(self) -> LearntRig | None:
+        """What was learnt, also by earlier runs; None where nothing is learnt."""
+        if self._held:
+            return self._rig
+        if not self._filter.names:
+            return None
+        n_before = 0 if self._rig is None else self._rig.n_frames
+        return LearntRig(
+            constants=self._filter.learnt,
+            information=self._filter.told,
+            n_frames=n_before + self._n_frames,
+        )
 
     def _settle(self) -> None:
         """Say what registrations take off, from now on."""
-        n_lens, learnt = len(LENS) if self._learns_lens else 0, self._constants
         if self._learns_lens:
-            constants = learnt.mean[:n_lens]
+            constants, _ = self._filter.of(LENS)
             field = np.einsum("k,kni->ni", constants, self._grid)
             size_px = math.sqrt(np.mean(np.sum(field**2, axis=1)))
-            is_told = learnt.significance(slice(n_lens)) > _GATE and size_px > _FEIGNED_PX
+            is_told = self._filter.significance(LENS) > self._gate and size_px > _FEIGNED_PX
             self.lens = (1.0 - _FEIGNED_PX / size_px) * constants if is_told else 0.0 * constants
-            self.rows = self._rows.mean
+            self.rows, _ = self._filter.of(ROWS)
         if self._readout_ms is None:
-            variance = float(learnt.covariance[n_lens, n_lens])
-            self.readout = float(learnt.mean[n_lens]), math.sqrt(variance)
+            self.readout = (self._filter.learnt | {**self._held})[READOUT]
         value, sigma = self.readout
-        is_rolling = abs(value) > (_GATE if self._is_stereo else 1.0) * sigma
+        is_rolling = abs(value) > (self._gate if self._is_stereo else 1.0) * sigma
         self.readout_s = value if is_rolling else 0.0
         is_possible = is_rolling or abs(value) + sigma > _LEAST_READOUT_S
         self.possible_readout_s = math.hypot(self.readout_s, sigma) if is_possible else 0.0
@@ -264,9 +315,11 @@ class RigOffsets:
 
     def note(self, told: Constants) -> None:
         """Take what a link tells of the constants, beside those that are taken off."""
+        if self._held:
+            return
         used = [*self.lens] if self._learns_lens else []
         used += [self.readout_s] if self._readout_ms is None else []
-        self._constants.note(told.information, told.score, np.array(used))
+        self._filter.note(self.names, told.information, told.score, np.array(used))
 
     def note_rows(self, pixels: FloatArray, shifts_px: FloatArray) -> None:
         """Take by how much rows of the right image are larger at pixels (n, 2), as measured.
@@ -280,17 +333,18 @@ class RigOffsets:
         fields = self._row_fields(pixels[told])
         left = shifts_px[told] - self.rows @ fields
         step: FloatArray = np.zeros(len(ROWS))
+        known = np.linalg.inv(self._filter.of(ROWS)[1])
         for _ in range(_N_ROW_STEPS):
             weights = 1.0 / (1.0 + ((left - step @ fields) / _ROW_KERNEL_PX) ** 2)
             weighted = fields * weights / _ROW_SIGMA_PX**2
             information, score = weighted @ fields.T, weighted @ left
-            step = np.linalg.solve(information + self._rows.information, score)
-        self._rows.note(information, score, self.rows)
+            step = np.asarray(np.linalg.solve(information + known, score))
+        self._filter.note(ROWS, information, score, self.rows)
 
     def advance(self) -> None:
         """Apply what was noted since the last frame."""
-        self._constants.advance()
-        self._rows.advance()
+        self._n_frames += 1
+        self._filter.advance()
         self._settle()
 
     def as_json(self) -> dict[str, float]:
@@ -300,7 +354,7 @@ class RigOffsets:
         """
         value, sigma = self.readout
         u, v, disparity = np.abs(np.einsum("k,kni->in", self.lens, self._grid))
-        rows = self.row_errors(self._places) if self._learns_lens else np.zeros(1)
+        rows = self.row_errors(self._places)
         offsets = {
             "disparity_px": round(float(disparity.max()), 4),
             "pixel_px": round(float(np.hypot(u, v).max()), 4),

@@ -20,7 +20,7 @@ from typing import Protocol
 import numpy as np
 
 from gvo.config import Config
-from gvo.frontend.offsets import LENS, READOUT, RigOffsets
+from gvo.frontend.offsets import RigOffsets
 from gvo.frontend.registration import check_rows, estimate_roughly, register_correspondences
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
@@ -28,6 +28,7 @@ from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.ransac import find_inliers
 from gvo.geometry.refinement import Adjustment, adjust, eliminate_pose
 from gvo.geometry.residuals import StereoResiduals
+from gvo.geometry.rig import LENS, READOUT
 from gvo.kernels import shutter
 from gvo.types import (
     Failure,
@@ -214,8 +215,6 @@ class CalibratedCamera:
         self._camera, self._offsets = camera, offsets
         # Those of the last registration that was found, and is not accepted yet.
         self._found: Measurements | None = None
-        # Those of the newest frame.
-        self._links: list[tuple[Measurements, RelativePose]] = []
 
     def correct(self, observations: Moving, uvd: FloatArray) -> FloatArray:
         """Return measured (u, v, disparity), shape (n, 3), as a camera without errors has them."""
@@ -301,7 +300,7 @@ class CalibratedCamera:
         if is_step:
             self._learn(measured.frames[0])
         elif self._offsets.names:
-            self._links.append((measured, result))
+            self._offsets.waiting.append((measured, result))
 
     def _register(
         self,
@@ -413,7 +412,7 @@ class CalibratedCamera:
         Keyframes tell it best, seen by a camera that moved another way. A velocity that is
         extrapolated would not do: changes of velocity that are noise look like a shorter readout.
         """
-        links, self._links = self._links, []
+        links, self._offsets.waiting = self._offsets.waiting, []
         names = self._offsets.names
         for measured, result in links:
             if measured.frames[1] is not frame:

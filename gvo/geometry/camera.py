@@ -12,6 +12,7 @@ import numpy as np
 
 from gvo.errors import CalibrationError
 from gvo.geometry.lens import DistortionModel, Lens, RectificationMaps, bouguet, bouguet_wide
+from gvo.geometry.rig import LearntRig
 from gvo.types import BoolArray, FloatArray
 
 
@@ -25,6 +26,8 @@ class PinholeCamera:
         Focal lengths and principal point, pixels.
     width, height : int
         Image size, pixels.
+    rig : LearntRig, optional
+        What was learnt of the camera before; `Odometry` starts from it.
     """
 
     fx: float
@@ -33,6 +36,7 @@ class PinholeCamera:
     cy: float
     width: int
     height: int
+    rig: LearntRig | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Check the intrinsics."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 from gvo._text import access_fault
 from gvo.config import Config
@@ -17,6 +18,7 @@ from gvo.io.datasets.euroc import EurocSource
 from gvo.io.datasets.kitti import KittiSource
 from gvo.io.datasets.tum import TumSource
 from gvo.io.recording import Source
+from gvo.io.rig_file import with_rig
 
 BAG_SUFFIXES = (".bag", *STORAGE_SUFFIXES)
 _KINDS = (
@@ -26,6 +28,7 @@ _KINDS = (
 # By such a name in it a folder is known to be one recording.
 FOLDER_MARKERS = ("metadata.yaml", "calib.txt", "times.txt", "mav0", "cam0", "rgb.txt")
 _PACKED = (".gz", ".bz2", ".xz", ".zst", ".zstd", ".lz4", ".zip", ".tar", ".tgz", ".7z")
+_Source: TypeAlias = BagSource | KittiSource | EurocSource | TumSource
 _TOPICS = ("left", "right", "color", "depth", "camera_info")
 
 
@@ -43,9 +46,12 @@ class RecordingOptions(TopicChoice):
         Topics of `CameraInfo` in a bag: of left, then right; or of colour, then depth.
     calibration : Path or sequence of Path
         Files that replace the recording's own calibration: one or two, or a folder.
+    rig : Path, optional
+        The `rig.yaml` of an earlier run with the same camera, which odometry starts from.
     """
 
     calibration: CalibrationPaths = None
+    rig: str | Path | None = None
 
 
 def open_recording(
@@ -80,10 +86,12 @@ def open_recording(
     config = config or Config()
     options = options or RecordingOptions()
     with named_faults(RecordingError, paths[0]):
-        return _open(paths, config, options)
+        source = _open(paths, config, options)
+    source.info = with_rig(source.info, options.rig)
+    return source
 
 
-def _open(paths: Sequence[Path], config: Config, options: RecordingOptions) -> Source:
+def _open(paths: Sequence[Path], config: Config, options: RecordingOptions) -> _Source:
     for one in paths:
         if fault := access_fault(one):
             raise RecordingError(f"{one}: {fault}; {_KINDS}")
@@ -116,7 +124,7 @@ def refuse_topics(options: TopicChoice, where: str | Path) -> None:
             )
 
 
-def _open_folder(path: Path, config: Config, options: RecordingOptions) -> Source:
+def _open_folder(path: Path, config: Config, options: RecordingOptions) -> _Source:
     refuse_topics(options, path)
     if _is_kitti(path):
         return KittiSource(path, calibration=options.calibration, config=config)

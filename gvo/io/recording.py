@@ -7,12 +7,13 @@ way from any source to frames: pair by stamp, decode, check, make grey, rectify.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
 from numpy.typing import NDArray
 
 from gvo.geometry.camera import Calibration, PinholeCamera, StereoCamera, stereo_camera
+from gvo.geometry.rig import LearntRig
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
 
@@ -88,6 +89,8 @@ class RecordingInfo:
         Name of stream 0's camera frame in `/tf`; empty where the recording names none.
     T_body_cam : ndarray of float64, shape (4, 4), optional
         Maps the rectified camera to the body the calibration names, metres.
+    rig : LearntRig, optional
+        What an earlier run learnt of the camera.
     """
 
     name: str
@@ -98,6 +101,7 @@ class RecordingInfo:
     depth_view: DepthView | None = None
     frame_id: str = ""
     T_body_cam: FloatArray | None = None
+    rig: LearntRig | None = None
 
     def __repr__(self) -> str:
         """Return one line: name, sensor, number and size of the images."""
@@ -120,9 +124,9 @@ class RecordingInfo:
     @property
     def camera(self) -> StereoCamera | PinholeCamera:
         """The camera of the rectified frames."""
-        if self.sensor == "stereo":
-            return stereo_camera(*self.calibrations)
-        return self.calibrations[0].pinhole()
+        is_stereo = self.sensor == "stereo"
+        camera = stereo_camera(*self.calibrations) if is_stereo else self.calibrations[0].pinhole()
+        return replace(camera, rig=self.rig)
 
 
 class Source(Protocol):

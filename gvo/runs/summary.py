@@ -22,6 +22,7 @@ from gvo.io.excerpt import Excerpt
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.poses.truth import TruthComparison
 from gvo.io.recording import Source
+from gvo.io.rig_file import rig_json
 from gvo.io.run_folder.writer import RunFolder
 from gvo.trajectory.evaluation import evaluations_json
 from gvo.trajectory.trajectory import Trajectory
@@ -42,6 +43,8 @@ def summarize(
 ) -> dict[str, Any]:
     """Return what `summary.json` holds of a run."""
     info, frame = loop.source.info, loop.base_frame
+    offsets = loop.statistics.rig_offsets
+    learnt = None if offsets is None else offsets.learnt
     return {
         "gvo_version": __version__,
         "state": state,
@@ -51,6 +54,7 @@ def summarize(
         "base_frame": ", ".join(filter(None, (frame.name or "camera", frame.origin))),
         **_truth_json(compared),
         **loop.statistics.as_json(),
+        "rig": None if learnt is None else rig_json(info.camera, learnt),
         "peak_memory_mb": round(peak_memory_mb(), 1),
         "warnings": warnings,
         "configuration": loop.config.model_dump(),
@@ -124,13 +128,16 @@ def run_identity(
         Values that are the same after writing and reading JSON.
     """
     info, view = source.info, source.info.depth_view
+    known = [*map(asdict, info.calibrations), view and asdict(view)]
+    if info.rig is not None:
+        known.append(asdict(info.rig))
     return {
         "version of gvo": __version__,
         "recording": {
             "sensor": info.sensor,
             "number of images": info.n_images,
             "frame_id": info.frame_id,
-            "calibration": digest([*map(asdict, info.calibrations), view and asdict(view)]),
+            "calibration": digest(known),
             "first image": "" if is_live else _first_image(source),
         },
         "excerpt": asdict(excerpt or Excerpt()),

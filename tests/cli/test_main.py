@@ -50,7 +50,9 @@ def test_run_writes_and_prints_errors(command: Command, room_bag: Path, tmp_path
     assert answer.err == ""
     names = {path.name for path in (tmp_path / "out").iterdir()}
     of_graph = {"global.txt", "global_covariance.csv", "graph.g2o", "loops.csv"}
-    assert names == {*TABLES, "timings.csv", "ground_truth.txt", "summary.json"} | of_graph
+    assert (
+        names == {*TABLES, "timings.csv", "ground_truth.txt", "summary.json", "rig.yaml"} | of_graph
+    )
 
 
 @pytest.mark.parametrize(
@@ -377,3 +379,26 @@ def test_a_second_run_into_the_usual_folder_says_so_last(
     assert last[0].startswith(f"wrote {folder}: 3 frames in ")
     assert last[1].startswith(f"wrote {folder}-2: 3 frames in ")
     assert [line.endswith(f"; {folder} holds an earlier run") for line in last] == [False, True]
+
+
+def test_a_run_keeps_what_it_learnt_and_another_starts_from_it(
+    drive_bag: Path, command: Command, here: Path
+) -> None:
+    short = ["--duration", "0.5", "--no-report"]
+    assert command("run", drive_bag, "--out", "first", *short).code == 0
+    kept = here / "first" / "rig.yaml"
+    held = json.loads((here / "first" / "summary.json").read_text())["rig"]
+    assert yaml.safe_load(kept.read_text()) == held
+    again = ["run", drive_bag, *short, "--rig", kept, "--out"]
+    assert command(*again, "again").code == 0
+    assert yaml.safe_load((here / "again/rig.yaml").read_text())["frames"] == 2 * held["frames"]
+    off = ["--set", "stereo.estimate_offset=false"]
+    assert command(*again, "held", *off).code == 0
+    assert yaml.safe_load((here / "held/rig.yaml").read_text()) == held
+    other = here / "other.yaml"
+    other.write_text(kept.read_text().replace("sensor: stereo", "sensor: rgbd"))
+    for name in ("run", "check", "explain"):
+        frame = ["--frame", "2"] if name == "explain" else []
+        assert "sensor rgbd" in refused(command(name, drive_bag, *frame, "--rig", other))
+    written = refused(command("convert", drive_bag, here / "new.mcap", "--rig", kept))
+    assert "--rig: images are written as they were recorded" in written

@@ -23,6 +23,7 @@ from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.lens import Lens
 from gvo.geometry.refinement import Adjustment, Constants
+from gvo.geometry.rig import READOUT, LearntRig
 from gvo.io.recording import Sensor
 from gvo.io.synthetic import RigError
 from gvo.kernels import shutter
@@ -74,12 +75,12 @@ def config(readout_ms: float | None = None, *, estimate_offset: bool = True) -> 
 @given(true=st.lists(st.floats(-0.2, 0.2), min_size=3, max_size=3), seed=st.integers(0, 999))
 def test_the_filter_finds_constants_within_their_sigmas(true: list[float], seed: int) -> None:
     rng = np.random.default_rng(seed)
-    found = ConstantFilter(np.zeros(3), np.full(3, 0.3))
+    found = ConstantFilter(dict.fromkeys("abc", (0.0, 0.3)))
     for _ in range(200):
         J, used = rng.normal(size=(20, 3)), rng.normal(size=3)
         # Errors of registrations are correlated: sigmas are three times larger.
         left = J @ (true - used) + 3.0 * rng.normal(size=20)
-        found.note(J.T @ J, J.T @ left, used)
+        found.note((*"abc",), J.T @ J, J.T @ left, used)
         found.advance()
     error = found.mean - true
     assert error @ np.linalg.solve(found.covariance, error) < 4.5**2 * 3
@@ -87,10 +88,9 @@ def test_the_filter_finds_constants_within_their_sigmas(true: list[float], seed:
 
 
 def test_what_is_not_told_stays_at_the_prior() -> None:
-    prior, sigmas = np.array([0.0, 0.3]), np.array([0.1, 0.2])
-    found = ConstantFilter(prior, sigmas)
+    found = ConstantFilter({"a": (0.0, 0.1), "b": (0.3, 0.2)})
     for _ in range(100):
-        found.note(np.diag([1000.0, 0.0]), np.zeros(2), np.zeros(2))
+        found.note(("a",), np.array([[1000.0]]), np.zeros(1), np.zeros(1))
         found.advance()
     assert found.mean[1] == pytest.approx(0.3)
     assert found.covariance[1, 1] == pytest.approx(0.2**2)
@@ -164,7 +164,7 @@ def test_an_error_is_taken_off_but_for_what_edges_feign(true_px: float, is_told:
         # What is left of it after the present value was subtracted.
         offsets.note(told({"d0": true_px - offsets.lens[0]}, 0.01, offsets.names))
         offsets.advance()
-    assert offsets.learnt["d0"][0] == pytest.approx(true_px, abs=0.01)
+    assert learnt_by(offsets).constants["d0"][0] == pytest.approx(true_px, abs=0.01)
     expected_px = np.sign(true_px) * (abs(true_px) - 0.05) * is_told
     assert offsets.lens[0] == pytest.approx(expected_px, abs=0.01)
 
@@ -175,6 +175,54 @@ def test_what_is_not_significant_is_not_taken_off(sigma: float, is_told: bool) -
     offsets.note(told({"d0": 0.3}, sigma, offsets.names))
     offsets.advance()
     assert offsets.lens.any() == is_told
+
+
+def learnt_by(offsets: RigOffsets) -> LearntRig:
+    assert offsets.learnt is not None
+    return offsets.learnt
+
+
+def taught(camera: StereoCamera = CAMERA, n: int = 50) -> RigOffsets:
+    """Return offsets that n frames told a lens, rows, and a readout of 8 ms."""
+    offsets, pixels = RigOffsets(camera, config()), points_in_view(200)[:, :2] * 5.0
+    for _ in range(n):
+        left = {"d0": -0.3 - offsets.lens[0], READOUT: 8e-3 - offsets.readout_s}
+        offsets.note(told(left, 0.002, offsets.names))
+        offsets.note_rows(pixels, np.full(200, 0.2))
+        offsets.advance()
+    return offsets
+
+
+def test_what_was_learnt_is_used_at_once_and_counts_less() -> None:
+    first = taught()
+    known = learnt_by(first)
+    assert known.n_frames == 50
+    again = RigOffsets(replace(CAMERA, rig=known), config())
+    np.testing.assert_allclose(again.lens, first.lens, atol=1e-3)
+    assert 0.4 < again.rows[0] / first.rows[0] < 1.0  # they were hardly told
+    assert again.readout_s == pytest.approx(first.readout_s, abs=5e-4)
+    sigmas = [learnt_by(each).constants["d0"][1] for each in (first, again)]
+    assert sigmas[1] / sigmas[0] == pytest.approx(2.0, rel=0.05)
+    twice = taught(replace(CAMERA, rig=known))
+    assert learnt_by(twice).n_frames == 100
+    # The same images hardly make it surer.
+    assert learnt_by(twice).constants["d0"][1] > 0.8 * sigmas[0]
+
+
+def test_what_was_learnt_is_held_where_nothing_is_to_be_learnt() -> None:
+    known = learnt_by(taught())
+    offsets = RigOffsets(replace(CAMERA, rig=known), config(estimate_offset=False))
+    assert offsets.lens[0] == known.constants["d0"][0]
+    assert offsets.rows[0] == known.constants["r0"][0]
+    value, sigma = offsets.readout
+    offsets.note(told({READOUT: 5e-3}, 1e-4, offsets.names))
+    offsets.note_rows(points_in_view(200)[:, :2], np.full(200, 0.9))
+    offsets.advance()
+    assert offsets.rows[0] == known.constants["r0"][0]
+    assert offsets.readout == (value, sigma)
+    assert offsets.learnt is known
+    given = RigOffsets(replace(CAMERA, rig=known), config(3.0, estimate_offset=False))
+    assert given.readout == (0.003, 0.0)
 
 
 LEARNT = {"d0": -0.3, "dyy": 0.004, "tx": -4e-3, "ty": 3e-3, "k1": 5e-3, "p1": 4e-4, "p2": -8e-4}
@@ -264,7 +312,7 @@ def test_what_is_refused_and_loops_tell_nothing_of_the_camera(
                     found = frontend.register(frames[0], current, MotionPrior(T_predicted=T))
                 assert isinstance(found, Failure) == (also == "refused")
             frontend.rig_offsets.advance()
-        return [value for value, _ in frontend.rig_offsets.learnt.values()]
+        return [value for value, _ in frontend.rig_offsets.learnt.constants.values()]
 
     assert learnt("loops") == learnt("refused") == learnt("") != learnt("links")
 
@@ -273,7 +321,7 @@ def test_nothing_is_learnt_where_it_is_switched_off() -> None:
     offsets = RigOffsets(CAMERA, config(12.5, estimate_offset=False))
     offsets.note_rows(points_in_view(200)[:, :2], np.full(200, 0.2))
     offsets.advance()
-    assert not offsets.learnt
+    assert offsets.learnt is None
     assert offsets.as_json() == {
         "disparity_px": 0.0,
         "pixel_px": 0.0,
@@ -623,7 +671,7 @@ Kind = Literal["klt", "descriptor"]
 def test_a_planted_offset_is_found_within_twenty_frames(kind: Kind, planted_px: float) -> None:
     offsets = learn(frames(planted_px), kind).rig_offsets
     assert offsets is not None
-    found_px, sigma_px = offsets.learnt["d0"]
+    found_px, sigma_px = learnt_by(offsets).constants["d0"]
     assert sigma_px < 0.1
     assert abs(found_px - planted_px) < 0.03 + 0.4 * abs(planted_px)
 

@@ -122,6 +122,8 @@ RULES: Mapping[str, Rule] = {
     "row offset": Rule(fault_low=-0.75, fault_high=0.75, unit="px", fix=_RECTIFIED),
     # Beyond, 5 % of the matches and more are not found on their rows.
     "row spread": Rule(fault_high=2.0, unit="px", fix=_RECTIFIED),
+    # What changes over the image is learnt and corrected by a run.
+    "row field": Rule(high=0.5, unit="px", fix="a run learns and corrects it; calibrate anew"),
     # Lenses of raw images have 0.2 to 0.4; what rectification leaves is a tenth of that.
     "lens distortion": Rule(
         fault_low=-0.15,

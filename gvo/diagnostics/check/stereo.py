@@ -34,6 +34,8 @@ _MAX_ROW_PX = 8.0
 _N_ROUNDS = 5
 _N_SIGMAS = 3.0
 _MAX_SIGMA = 0.03
+# What rows are off by is told from so many sigmas on.
+_SIGNIFICANT = 4.0
 # The sign of smaller disparities is noise.
 _SIGN_PX = 1.0
 # Row differences farther from the median are wrong matches.
@@ -109,6 +111,29 @@ def lens_error(matches: FloatArray, camera: PinholeCamera) -> tuple[float, float
     y = camera.fy * left[:, 1]
     pattern = y * (np.sum(left**2, axis=1) - np.sum(right**2, axis=1))
     columns = np.column_stack([np.ones(len(y)), y, camera.fy * left[:, 0], pattern])
+    found = _fit(columns, rows)
+    if found is None:
+        return 0.0, math.inf
+    return float(found[0][3]), float(np.sqrt(found[1][3, 3]))
+
+
+def row_field(matches: FloatArray, camera: PinholeCamera) -> float:
+    """Return by how much v_right - v_left is off anywhere, as a polynomial of the place, pixels.
+
+    Where that is not significant it is zero.
+    """
+    x, y = camera.unproject(matches[:, :2])[:, :2].T
+    columns = np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
+    found = _fit(columns, matches[:, 3] - matches[:, 1])
+    if found is None:
+        return 0.0
+    errors = np.abs(columns @ found[0])
+    sigmas = np.sqrt(np.sum((columns @ found[1]) * columns, axis=1))
+    return float(np.max(errors * (errors > _SIGNIFICANT * sigmas)))
+
+
+def _fit(columns: FloatArray, rows: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    """Return the robust solution of a linear model and its covariance; None if it is not told."""
     is_kept = np.abs(rows - np.median(rows)) < _MAX_ROW_PX
     for _ in range(_N_ROUNDS):
         errors = rows - columns @ _solve(columns[is_kept], rows[is_kept])
@@ -116,9 +141,9 @@ def lens_error(matches: FloatArray, camera: PinholeCamera) -> tuple[float, float
         is_kept = np.abs(errors) <= _N_SIGMAS * spread + 1e-6
     kept = columns[is_kept]
     if np.linalg.matrix_rank(kept) < kept.shape[1]:
-        return 0.0, math.inf
-    variance = float(np.var(errors[is_kept])) * np.linalg.pinv(kept.T @ kept)[3, 3]
-    return float(_solve(kept, rows[is_kept])[3]), float(np.sqrt(variance))
+        return None
+    covariance = float(np.var(errors[is_kept])) * np.linalg.pinv(kept.T @ kept)
+    return _solve(kept, rows[is_kept]), np.asarray(covariance)
 
 
 def _solve(columns: FloatArray, values: FloatArray) -> FloatArray:
@@ -161,16 +186,18 @@ def check_stereo(
     if len(matches) < MIN_STEREO_MATCHES:
         yield unknown("left/right: rows", f"{len(matches)} matches are too few")
         return
-    yield from _check_rows(matches)
+    yield from _check_rows(matches, camera)
     yield _check_lens(matches, camera)
     yield _check_order(matches)
     yield _check_step(samples, matcher)
 
 
-def _check_rows(matches: FloatArray) -> Iterator[Finding]:
+def _check_rows(matches: FloatArray, camera: PinholeCamera) -> Iterator[Finding]:
     median_px, spread_px = row_error(matches)
     yield measured("left/right: row offset", median_px, text=f"{median_px:+z.2f} px median")
     yield measured("left/right: row spread", spread_px, text=f"{spread_px:.2f} px at 95 %")
+    field_px = row_field(matches, camera)
+    yield measured("left/right: row field", field_px, text=f"up to {field_px:.2f} px")
     # Half rows: corners lie on whole pixels.
     reach_px = math.ceil(2.0 * (spread_px + 0.25)) / 2.0
     yield Finding(

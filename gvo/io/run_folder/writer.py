@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from gvo._text import visible
 from gvo.errors import OutputError, write_faults
@@ -29,6 +30,7 @@ from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, FaultyFrame, FrameResult, IntArray, Optimum, Status
 
 SUMMARY = "summary.json"
+RIG = "rig.yaml"
 LOCK = "run.lock"
 PICTURE = "trajectories.png"
 REPORT = "report.html"
@@ -55,8 +57,10 @@ EDGES_HEADER = ("stamp_ns", "reference_ns", "kind", "is_accepted", "chi2")
 _STAGES = ("read", "extract", "register", "links", "window", "loops")
 TIMINGS_HEADER = ("stamp_ns", *(f"{stage}_ms" for stage in _STAGES))
 
+_RIG_HEADER = "# What was learnt of this camera: `gvo run RECORDING --rig FILE` starts from it."
+
 _RESULTS = (
-    *(SUMMARY, "edges.csv", "timings.csv", PICTURE, REPORT),
+    *(SUMMARY, RIG, "edges.csv", "timings.csv", PICTURE, REPORT),
     *(TRUTH, TRUE_POSITIONS, GRAPH, LOOPS, f"{GLOBAL}.txt"),
     "frames.csv",
     *(f"{name}.txt" for name in TRAJECTORIES),
@@ -291,9 +295,12 @@ class RunFolder(AbstractContextManager["RunFolder"]):
             path.write_text("".join(lines), encoding="utf-8")
 
     def write_summary(self, summary: dict[str, Any]) -> None:
-        """Replace `summary.json` atomically."""
+        """Replace `summary.json` and `rig.yaml` atomically."""
         with self._refused_on_error(self.path / SUMMARY):
             save_summary(self.path, summary)
+            if rig := summary.get("rig"):
+                text = yaml.safe_dump(rig, sort_keys=False, default_flow_style=None, width=100)
+                replace_text(self.path / RIG, f"{_RIG_HEADER}\n{text}")
 
     def discard(self) -> None:
         """Remove the files of a run that gave nothing."""

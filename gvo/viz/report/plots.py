@@ -67,6 +67,7 @@ TITLES = {
     "counts": "Features, matches and inliers",
     "timings": "Milliseconds per frame",
     "chi2": "Chi-square of the edges",
+    "rig": "What calibration left",
 }
 """Of the plots of a run, by slug, in their order."""
 

@@ -46,6 +46,7 @@ from gvo.viz.report.plots import (
     status_plot,
     timing_plot,
 )
+from gvo.viz.report.rig import rig_plots
 
 _TRUTH_PLOTS = ("errors_over_time", "errors_over_distance", "drift", "covariance")
 _LOOP_COLUMNS = ("at [s]", "place of [s]", "inliers", "residual", "why refused")
@@ -148,6 +149,7 @@ def write_run_report(
             count_plot(record.frames),
             timing_plot(record.timings),
             edge_plot(record.edges, _first_ns(record)),
+            *rig_plots(record.summary.get("rig")),
         ]
         # The page first: it must exist even if the folder cannot be written.
         scene = None if world is None else turning_scene(lines, world)

@@ -17,7 +17,7 @@ from tests.viz.report_page import Page
 
 SECTIONS = [
     *("above", "side", "space", "errors_over_time", "errors_over_distance", "drift", "covariance"),
-    *("status", "counts", "timings", "chi2"),
+    *("status", "counts", "timings", "chi2", "rig"),
 ]
 
 
