@@ -70,13 +70,18 @@ class SyncConfig(Section):
 
 
 class ImagesConfig(Section):
-    """Grey and colour images of 16 bits, reduced to 8."""
+    """Grey and colour images: how 16 bits become 8, and which pixels are not used."""
 
     black: int = _common(
         0, "largest value mapped to black; above 0 for some thermal cameras", ge=0, le=65534
     )
     white: int = _common(
         65535, "smallest value mapped to white; 4095 for a camera of 12 bits", ge=1, le=65535
+    )
+    mask: tuple[str, ...] = _common(
+        (),
+        "files of masks as for --mask, from this one's folder: [both], or [left, right]",
+        max_length=2,
     )
 
 
@@ -312,7 +317,9 @@ def _read_yaml(path: Path) -> dict[str, dict[str, object]]:
                 f"{path}: {cut(str(section), MAX_SHOWN)} must hold keys, see `gvo config --all`"
             )
     with named_faults(ConfigurationError, path, others=(ConfigurationError,)):
-        validate_configuration(content)
+        config = validate_configuration(content)
+    if config.images.mask:
+        content["images"]["mask"] = [str(path.parent / name) for name in config.images.mask]
     return content
 
 
@@ -356,7 +363,7 @@ def _explain(error: ValidationError) -> str:
 def values_by_name(config: Config) -> dict[str, Value]:
     """Return the values of all parameters by `section.key`."""
     return {
-        f"{section}.{key}": value
+        f"{section}.{key}": ", ".join(value) if isinstance(value, tuple) else value
         for section, values in config.model_dump().items()
         for key, value in values.items()
     }
@@ -395,8 +402,9 @@ def describe_configuration(config: Config, *, for_experts: bool = True) -> str:
     return "\n".join(lines[1:]) + "\n"
 
 
-def _yaml(value: Value) -> str:
-    return str(yaml.safe_dump(value).splitlines()[0])
+def _yaml(value: Value | tuple[str, ...]) -> str:
+    plain = [*value] if isinstance(value, tuple) else value
+    return str(yaml.safe_dump(plain, default_flow_style=None, width=math.inf).splitlines()[0])
 
 
 def is_expert(field: Any) -> bool:  # noqa: ANN401 - a field of pydantic's
@@ -411,7 +419,7 @@ def describe_field(field: Any) -> str:  # noqa: ANN401 - a field of pydantic's
 
 
 def _choices(field: Any) -> str:  # noqa: ANN401
-    choices = getattr(field.annotation, "__args__", ())
+    choices = [each for each in get_args(field.annotation) if each is not Ellipsis]
     if choices and all(isinstance(choice, str) for choice in choices):
         return " | ".join(choices)
     return ", ".join(f"{sign} {limit:g}" for sign, limit in _limits(field).items())
@@ -468,9 +476,13 @@ class Parameter:
 
 
 def list_parameters() -> dict[str, list[Parameter]]:
-    """Return the parameters by section, in the order of the configuration."""
+    """Return the parameters by section, in the order of the configuration; not names of files."""
     return {
-        section: [_shown(section, key, field) for key, field in model.model_fields.items()]
+        section: [
+            _shown(section, key, field)
+            for key, field in model.model_fields.items()
+            if not isinstance(field.default, tuple)
+        ]
         for section, model in sections().items()
     }
 

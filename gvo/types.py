@@ -40,6 +40,14 @@ def _check_kernel(kernel: str | None) -> None:
         raise ValueError(f"kernel must be one of {get_args(Kernel)}, got {kernel!r}")
 
 
+def _check_mask(kind: str, image: ImageArray, mask: NDArray[Any] | None) -> None:
+    if mask is not None and (mask.dtype != np.uint8 or mask.shape != image.shape):
+        raise ValueError(
+            f"the mask of {kind} must be uint8 of shape {image.shape}, "
+            f"got {mask.dtype} {mask.shape}"
+        )
+
+
 def _check_images(
     kind: str, stamp_ns: int, first: NDArray[Any], second: NDArray[Any], dtype: type
 ) -> None:
@@ -137,15 +145,21 @@ class StereoFrame:
         Stamp of the left image, nanoseconds.
     left, right : ndarray of uint8, shape (height, width)
         Rectified grey images: a point lies on the same row of both.
+    mask, right_mask : ndarray of uint8, shape (height, width), optional
+        0 where nothing of the left or right image is to be used.
     """
 
     stamp_ns: int
     left: ImageArray
     right: ImageArray
+    mask: ImageArray | None = None
+    right_mask: ImageArray | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and types once."""
         _check_images("a stereo frame", self.stamp_ns, self.left, self.right, np.uint8)
+        for mask in (self.mask, self.right_mask):
+            _check_mask("a stereo frame", self.left, mask)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -162,16 +176,23 @@ class RgbdFrame:
         Metres along the optical axis, NaN = unknown.
     depth_stamp_ns : int, optional
         Stamp of the depth image; None: taken with the colour image.
+    mask : ndarray of uint8, shape (height, width), optional
+        0 where nothing is to be used: depth becomes unknown there.
     """
 
     stamp_ns: int
     image: ImageArray
     depth: DepthArray
     depth_stamp_ns: int | None = None
+    mask: ImageArray | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and types once."""
         _check_images("an RGB-D frame", self.stamp_ns, self.image, self.depth, np.float32)
+        _check_mask("an RGB-D frame", self.image, self.mask)
+        if self.mask is not None:
+            depth = np.where(self.mask > 0, self.depth, np.float32(np.nan))
+            object.__setattr__(self, "depth", depth)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -67,11 +67,15 @@ def batch(
     asked, files = _sort_arguments(recordings, configs or [])
     variants = make_variants(files, opt.with_loops(set_, loops), sweep or [])
     found = find_recordings(asked)
-    files_from_anywhere = tuple(path.absolute() for path in paths_of(options.calibration))
+    calibrations, masks = (
+        tuple(path.absolute() for path in paths)
+        for paths in (paths_of(options.calibration), options.mask)
+    )
     batch_options = BatchOptions(
         recording=replace(
             options,
-            calibration=files_from_anywhere,
+            calibration=calibrations,
+            mask=masks,
             rig=None if options.rig is None else Path(options.rig).absolute(),
         ),
         excerpt=excerpt,

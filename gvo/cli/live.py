@@ -181,24 +181,25 @@ def _wait(
     frame: str | None,
 ) -> tuple[Source, BaseFrame]:
     """Wait for the topics of a camera and its calibration; return it with its base frame."""
+    from gvo.io.opening import as_asked
     from gvo.io.poses.base_frame import find_base_frame
-    from gvo.io.rig_file import with_rig
     from gvo.live.topics import NetworkReader, TopicSource, wait_for
 
     reader = NetworkReader(cast("Transport", network))
 
-    def find() -> tuple[Source, BaseFrame]:
+    def find() -> tuple[TopicSource, BaseFrame]:
         calibration = options.calibration
         source = TopicSource(reader, topics=options, calibration=calibration, config=config)
-        source.info = with_rig(source.info, options.rig)
         return source, find_base_frame(source, frame)
 
     found = wait_for(find, _say, has_signal)
     if found is None:
         raise KeyboardInterrupt
-    for line in found[0].info.decisions:
+    source, base_frame = found
+    source.info = as_asked(source.info, config, options)
+    for line in source.info.decisions:
         _say(line)
-    return found
+    return source, base_frame
 
 
 def _own_camera(
@@ -206,8 +207,7 @@ def _own_camera(
 ) -> Source:
     from gvo.io.calibration.files import paths_of
     from gvo.io.frames import Rig
-    from gvo.io.opening import refuse_topics
-    from gvo.io.rig_file import with_rig
+    from gvo.io.opening import as_asked, refuse_topics
     from gvo.live.sources import Device, StandardInput
 
     refuse_topics(options, "camera" if names else "-")
@@ -215,7 +215,7 @@ def _own_camera(
     if not 1 <= len(files) <= 2:
         raise ConfigurationError(f"expected one or two --calibration, got {len(files)}")
     rig = Rig(*files, sensor=sensor, is_rectified=is_rectified)
-    info = with_rig(rig.info, options.rig)
+    info = as_asked(rig.info, config, options)
     if names:
         return Device(names, info)
     number, scale = sys.stdin.fileno(), rig.depth_scale

@@ -133,6 +133,13 @@ def _recording_options(
         Path | None,
         Option(metavar="FILE", help="The rig.yaml of an earlier run with the same camera."),
     ] = None,
+    mask: Annotated[
+        list[Path] | None,
+        Option(
+            metavar="PNG",
+            help="Image of the size of those recorded: 0 = not used. May be repeated: left, right.",
+        ),
+    ] = None,
     left: Annotated[str | None, _topic("the left images")] = None,
     right: Annotated[str | None, _topic("the right images")] = None,
     color: Annotated[str | None, _topic("the colour images")] = None,
@@ -147,6 +154,7 @@ def _recording_options(
     return RecordingOptions(
         calibration=tuple(calibration or ()),
         rig=rig,
+        mask=tuple(mask or ()),
         camera_info=tuple(camera_info or ()),
         **topics,
     )

@@ -101,12 +101,15 @@ class DescriptorFrontend:
     def _extract_both(self, frame: StereoFrame) -> tuple[Features, Features]:
         first, second = self._extractors
         if self._pool is None:
-            return first.extract(frame.left), second.extract(frame.right)
-        pending = self._pool.submit(second.extract, frame.right)
-        return first.extract(frame.left), pending.result()
+            return (
+                first.extract(frame.left, frame.mask),
+                second.extract(frame.right, frame.right_mask),
+            )
+        pending = self._pool.submit(second.extract, frame.right, frame.right_mask)
+        return first.extract(frame.left, frame.mask), pending.result()
 
     def _extract_rgbd(self, frame: RgbdFrame) -> DescriptorObservations:
-        features = self._extractors[0].extract(frame.image)
+        features = self._extractors[0].extract(frame.image, frame.mask)
         depths, is_valid = sample_depth(frame.depth, features.keypoints, self._config.depth)
         chosen = np.flatnonzero(is_valid)
         disparities = self.camera.depth_to_disparity(depths[chosen])

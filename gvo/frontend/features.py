@@ -85,14 +85,16 @@ class FeatureExtractor:
         self._orb = _make_orb(config, config.fast_threshold)
         self._detectors = _make_detectors(config, self._orb)
 
-    def extract(self, image: ImageArray) -> Features:
+    def extract(self, image: ImageArray, mask: ImageArray | None = None) -> Features:
         """Return the keypoints of a grey image, spread over a grid, with descriptors.
 
         Parameters
         ----------
         image : ndarray of uint8, shape (height, width)
+        mask : ndarray of uint8, shape (height, width), optional
+            0 where there are to be no keypoints.
         """
-        found = self._detect(image)
+        found = self._detect(image, mask)
         if self._config.kind in ("fast", "gftt"):
             found = _inside(found, image.shape)
         found = _spread(found, self._config)
@@ -109,11 +111,11 @@ class FeatureExtractor:
             descriptors=_typed(descriptors, self._config.kind),
         )
 
-    def _detect(self, image: ImageArray) -> Sequence[cv2.KeyPoint]:
+    def _detect(self, image: ImageArray, mask: ImageArray | None) -> Sequence[cv2.KeyPoint]:
         """Detect with the first detector that fills the budget, or the last one."""
         found: Sequence[cv2.KeyPoint] = ()
         for detector in self._detectors:
-            found = detector.detect(image)
+            found = detector.detect(image, mask)
             if len(found) >= self._config.n_features:
                 break
         return found

@@ -121,7 +121,9 @@ class KltFrontend:
     def _find_corners(
         self, frame: Frame, half: ImageArray, n_corners: int, *, spacing_px: int = SPACING_PX
     ) -> KltCorners:
-        corners = detect_corners(image_of(frame), n_corners, spacing_px=spacing_px, half=half)
+        corners = detect_corners(
+            image_of(frame), n_corners, spacing_px=spacing_px, half=half, mask=frame.mask
+        )
         row_shifts_px = np.full(len(corners), np.nan)
         if isinstance(frame, StereoFrame):
             config, images = self._config.stereo, (frame.left, frame.right)
@@ -134,6 +136,7 @@ class KltFrontend:
             disparities, slopes = measured.disparities, measured.slopes
             row_shifts_px = measured.row_shifts_px + row_offsets_px
             is_valid = measured.are_reliable & self._is_in_range(corners, disparities)
+            is_valid &= is_unmasked(frame, corners, disparities)
         else:
             disparities, is_valid = self._measure_depth(frame, corners)
             slopes = np.zeros_like(corners)
@@ -447,7 +450,7 @@ class KltFrontend:
         self, frame: Frame, pixels: FloatArray, expected: Expected, search: _Search
     ) -> tuple[FloatArray, BoolArray]:
         """Measure the disparities of tracks, virtual ones of RGB-D."""
-        if isinstance(frame, RgbdFrame):
+        if isinstance(frame, RgbdFrame):  # depth that is masked is not known
             return self._measure_depth(frame, pixels)
         config, images = self._config.stereo, (frame.left, frame.right)
         row_offsets_px = self.rig_offsets.row_errors(pixels)
@@ -456,7 +459,8 @@ class KltFrontend:
         disparities, is_valid = measure(
             images, pixels, expected.uvd[:, 2], config, row_offsets_px=row_offsets_px
         )
-        return disparities, is_valid & self._is_in_range(pixels, disparities)
+        is_valid &= self._is_in_range(pixels, disparities)
+        return disparities, is_valid & is_unmasked(frame, pixels, disparities)
 
     def _is_in_range(self, pixels: FloatArray, disparities: FloatArray) -> BoolArray:
         ideal = self.rig_offsets.take_off(np.column_stack([pixels, disparities]))
@@ -650,6 +654,19 @@ class KltPlace:
             row_shifts_px=np.full(len(self.uvd), np.nan),
         )
         return KltReference(stamp_ns=self.stamp_ns, corners=corners, motion=self.motion)
+
+
+def is_unmasked(frame: StereoFrame, pixels: FloatArray, disparities: FloatArray) -> BoolArray:
+    """Tell which pixels (n, 2) with these disparities no mask covers, left and right."""
+    shifts = np.column_stack([np.nan_to_num(disparities), np.zeros(len(pixels))])
+    views = zip((frame.mask, frame.right_mask), (pixels, pixels - shifts), strict=True)
+    is_used = np.ones(len(pixels), np.bool_)
+    for mask, places in views:
+        if mask is not None:
+            limits = mask.shape[1] - 1, mask.shape[0] - 1
+            u, v = np.clip(np.rint(places), 0, limits).astype(np.int64).T
+            is_used &= mask[v, u] > 0
+    return is_used
 
 
 def image_of(frame: Frame) -> ImageArray:

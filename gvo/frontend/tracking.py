@@ -124,6 +124,7 @@ def detect_corners(
     *,
     spacing_px: int = SPACING_PX,
     half: ImageArray | None = None,
+    mask: ImageArray | None = None,
 ) -> FloatArray:
     """Detect the corners of an image, to two pixels.
 
@@ -139,6 +140,8 @@ def detect_corners(
         Side of the cells with at most one corner each.
     half : ndarray of uint8, optional
         The image halved, where it is at hand.
+    mask : ndarray of uint8, shape (height, width), optional
+        0 where there are to be no corners.
 
     Returns
     -------
@@ -155,6 +158,9 @@ def detect_corners(
     corners.find_corners(np.ascontiguousarray(half), border, spacing_px, rows, places, scores)
     by_rows = np.argsort(places, axis=None)[np.count_nonzero(places < 0) :]
     v, u = np.divmod(places.ravel()[by_rows], half.shape[1])
+    if mask is not None:
+        is_used = mask[corners.REDUCTION * v, corners.REDUCTION * u] > 0
+        by_rows, v, u = by_rows[is_used], v[is_used], u[is_used]
     pixels = np.stack([u, v], axis=1) * float(corners.REDUCTION)
     chosen = choose_spread(
         pixels,

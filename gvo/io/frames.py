@@ -27,11 +27,13 @@ from gvo.io.sync import Paired, StampFilter, pair_images
 from gvo.types import DepthArray, FaultyFrame, Frame, ImageArray, RgbdFrame, StereoFrame
 
 _ROW_STEP = 64
+_MASK_MARGIN_PX = 5  # half the side of the patches around corners
 # Frames that are decoded ahead: with one, the thread idles where tracking a frame takes long.
 _N_AHEAD = 2
 # What reading or decoding one image may raise besides, in a source of one's own as well.
 _LOAD_ERRORS = (OSError, MemoryError, ValueError, cv2.error)
 _Preparers: TypeAlias = tuple["ImagePreparer", "ImagePreparer"]
+_Masks: TypeAlias = tuple[ImageArray | None, ImageArray | None]
 Through: TypeAlias = Callable[[Iterator[Paired]], Iterator[Paired]]
 _Prepared: TypeAlias = NDArray[Any] | str
 _Jobs: TypeAlias = Sequence[tuple[Callable[[], _Prepared], Future[_Prepared] | None]]
@@ -139,6 +141,7 @@ def _decoded(
     items: Iterator[Paired], preparers: _Preparers, info: RecordingInfo, threads: int, n_ahead: int
 ) -> Iterator[Frame | FaultyFrame]:
     """Yield the frames of pairs, decoded ahead where there are other threads."""
+    finish = partial(_finish, sensor=info.sensor, masks=_masks_of(preparers))
     is_alone = threads == 1
     n_ahead = 0 if is_alone else n_ahead
     started: deque[_Started] = deque()
@@ -151,15 +154,15 @@ def _decoded(
                     (item, [(job, None if is_alone else pool.submit(job)) for job in jobs])
                 )
                 if len(started) > n_ahead:
-                    yield _finish(*started.popleft(), info.sensor)
+                    yield finish(*started.popleft())
         except GvoError:
             # What was read before it counts.
-            yield from (_finish(*each, info.sensor) for each in started)
+            yield from (finish(*each) for each in started)
             raise
-        yield from (_finish(*each, info.sensor) for each in started)
+        yield from (finish(*each) for each in started)
 
 
-def _finish(item: Paired, jobs: _Jobs, sensor: Sensor) -> Frame | FaultyFrame:
+def _finish(item: Paired, jobs: _Jobs, sensor: Sensor, masks: _Masks) -> Frame | FaultyFrame:
     if isinstance(item, FaultyFrame):
         return item
     # What no other thread has begun is done on this one, which would wait.
@@ -168,7 +171,7 @@ def _finish(item: Paired, jobs: _Jobs, sensor: Sensor) -> Frame | FaultyFrame:
     if isinstance(first, str) or isinstance(second, str):
         reasons = [each for each in (first, second) if isinstance(each, str)]
         return FaultyFrame(stamp_ns=item[0].stamp_ns, reason="; ".join(reasons))
-    return _frame_of(sensor, (item[0].stamp_ns, item[1].stamp_ns), first, second)
+    return _frame_of(sensor, (item[0].stamp_ns, item[1].stamp_ns), first, second, masks)
 
 
 def _prepare(image: StampedImage, preparer: ImagePreparer, info: RecordingInfo) -> _Prepared:
@@ -182,12 +185,19 @@ def _prepare(image: StampedImage, preparer: ImagePreparer, info: RecordingInfo) 
 
 
 def _frame_of(
-    sensor: Sensor, stamps_ns: tuple[int, int], first: NDArray[Any], second: NDArray[Any]
+    sensor: Sensor,
+    stamps_ns: tuple[int, int],
+    first: NDArray[Any],
+    second: NDArray[Any],
+    masks: _Masks,
 ) -> Frame:
     stamp_ns, depth_ns = stamps_ns
+    mask, right = masks
     if sensor == "stereo":
-        return StereoFrame(stamp_ns=stamp_ns, left=first, right=second)
-    return RgbdFrame(stamp_ns=stamp_ns, image=first, depth=second, depth_stamp_ns=depth_ns)
+        return StereoFrame(stamp_ns=stamp_ns, left=first, right=second, mask=mask, right_mask=right)
+    return RgbdFrame(
+        stamp_ns=stamp_ns, image=first, depth=second, depth_stamp_ns=depth_ns, mask=mask
+    )
 
 
 def refuse_repeats(
@@ -258,10 +268,15 @@ def _is_same(first: ImageArray, second: ImageArray) -> bool:
 
 def make_preparers(info: RecordingInfo) -> _Preparers:
     """Return the preparers of both streams; depth of another camera is registered to colour."""
-    first = ImagePreparer(info.calibrations[0])
+    masks = info.masks or (None, None)
+    first = ImagePreparer(info.calibrations[0], mask=masks[0])
     if info.sensor == "stereo":
-        return first, ImagePreparer(info.calibrations[1])
+        return first, ImagePreparer(info.calibrations[1], mask=masks[1])
     return first, ImagePreparer(info.calibrations[0], is_depth=True, depth_view=info.depth_view)
+
+
+def _masks_of(preparers: _Preparers) -> _Masks:
+    return preparers[0].mask, preparers[1].mask
 
 
 class Rig:
@@ -342,8 +357,9 @@ class Rig:
         if self.info.sensor == "rgbd":
             second = self._metres(np.asarray(second))
         images = zip(self._preparers, (first, second), strict=True)
-        prepared = [prepare(image) for prepare, image in images]
-        return _frame_of(self.info.sensor, (stamp_ns, stamp_ns), *prepared)
+        left, right = (prepare(image) for prepare, image in images)
+        masks = _masks_of(self._preparers)
+        return _frame_of(self.info.sensor, (stamp_ns, stamp_ns), left, right, masks)
 
     def _metres(self, depth: NDArray[Any]) -> DepthArray:
         if depth.dtype.kind == "f":
@@ -355,6 +371,16 @@ class ImagePreparer:
     """Prepares the raw pixels of one stream for a frame: checks, makes grey, rectifies.
 
     Depth is rectified by the nearest pixel, so that no depth is made up.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    is_depth : bool
+    depth_view : DepthView, optional
+        Of depth that is seen by another camera.
+    mask : ndarray of uint8, shape (h, w), optional
+        0 where raw pixels are not used; rectified likewise it is the attribute of that name. It is
+        grown by the half size of a patch, which would see what is behind its edge.
     """
 
     def __init__(
@@ -363,6 +389,7 @@ class ImagePreparer:
         *,
         is_depth: bool = False,
         depth_view: DepthView | None = None,
+        mask: ImageArray | None = None,
     ) -> None:
         recorded = calibration if depth_view is None else depth_view.calibration
         self._size = (recorded.height, recorded.width)
@@ -374,6 +401,7 @@ class ImagePreparer:
             # Linear interpolation is faster with fixed-point maps, the nearest pixel is not.
             fixed = cv2.convertMaps(*self._maps, cv2.CV_16SC2)
             self._fixed_maps = (np.asarray(fixed[0]), np.asarray(fixed[1]))
+        self.mask = mask if mask is None else self._rectified_mask(mask)
 
     def __call__(self, pixels: NDArray[Any]) -> NDArray[Any]:
         """Return grey uint8 (h, w) of grey or BGR pixels; of metres (h, w) float32 metres."""
@@ -385,6 +413,12 @@ class ImagePreparer:
                 "(--calibration FILE)"
             )
         return self._depth(pixels) if self._is_depth else self._grey(pixels)
+
+    def _rectified_mask(self, mask: ImageArray) -> ImageArray:
+        if self._maps is not None:  # what is outside of the image is not masked by this
+            mask = np.asarray(cv2.remap(mask, *self._maps, cv2.INTER_NEAREST, borderValue=255))
+        side = 2 * _MASK_MARGIN_PX + 1
+        return np.asarray(cv2.erode(mask, np.ones((side, side), np.uint8)), dtype=np.uint8)
 
     def _depth(self, depth: NDArray[Any]) -> DepthArray:
         if self._register is not None:

@@ -55,6 +55,20 @@ def read_image(path: Path, grey_range: ImagesConfig = _FULL_RANGE) -> ImageArray
     return to_8_bit(decode_image(_read_bytes(path), str(path)), str(path), grey_range)
 
 
+def read_mask(path: Path, width: int, height: int) -> ImageArray:
+    """Return a grey image of 8 bits, 0 = not used, which has to have this size."""
+    pixels = decode_image(_read_bytes(path), str(path))
+    if pixels.ndim == 3 and (pixels == pixels[..., :1]).all():
+        pixels = pixels[..., 0]
+    if pixels.ndim != 2 or pixels.dtype != np.uint8:
+        kind = "colours" if pixels.ndim == 3 else f"{8 * pixels.itemsize} bits"
+        raise RecordingError(f"{path}: expected a mask of 8 bits grey, 0 = not used, got {kind}")
+    if pixels.shape != (height, width):
+        size = f"{pixels.shape[1]}x{pixels.shape[0]}"
+        raise RecordingError(f"{path}: the mask has {size} pixels, the images {width}x{height}")
+    return pixels
+
+
 def read_depth(path: Path, scale: float) -> DepthArray:
     """Return the metres (h, w), NaN = unknown, of a 16-bit grey image of counts."""
     return depth_from_counts(decode_image(_read_bytes(path), str(path)), scale, str(path))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -17,7 +17,8 @@ from gvo.io.calibration.files import CalibrationPaths
 from gvo.io.datasets.euroc import EurocSource
 from gvo.io.datasets.kitti import KittiSource
 from gvo.io.datasets.tum import TumSource
-from gvo.io.recording import Source
+from gvo.io.images import read_mask
+from gvo.io.recording import RecordingInfo, Source
 from gvo.io.rig_file import with_rig
 
 BAG_SUFFIXES = (".bag", *STORAGE_SUFFIXES)
@@ -28,7 +29,7 @@ _KINDS = (
 # By such a name in it a folder is known to be one recording.
 FOLDER_MARKERS = ("metadata.yaml", "calib.txt", "times.txt", "mav0", "cam0", "rgb.txt")
 _PACKED = (".gz", ".bz2", ".xz", ".zst", ".zstd", ".lz4", ".zip", ".tar", ".tgz", ".7z")
-_Source: TypeAlias = BagSource | KittiSource | EurocSource | TumSource
+_Opened: TypeAlias = BagSource | KittiSource | EurocSource | TumSource
 _TOPICS = ("left", "right", "color", "depth", "camera_info")
 
 
@@ -46,11 +47,15 @@ class RecordingOptions(TopicChoice):
         Topics of `CameraInfo` in a bag: of left, then right; or of colour, then depth.
     calibration : Path or sequence of Path
         Files that replace the recording's own calibration: one or two, or a folder.
+    mask : tuple of Path
+        Images in which 0 marks pixels that are not used, of the size of those recorded: one for
+        both cameras, or left and right; of RGB-D, one for colour.
     rig : Path, optional
         The `rig.yaml` of an earlier run with the same camera, which odometry starts from.
     """
 
     calibration: CalibrationPaths = None
+    mask: tuple[Path, ...] = ()
     rig: str | Path | None = None
 
 
@@ -76,7 +81,8 @@ def open_recording(
     ValueError
         If no path is given.
     RecordingError
-        When a path is missing or holds no recording, or does not hold what is needed.
+        When a path is missing or holds no recording, or does not hold what is needed; when a mask
+        does not fit.
     CalibrationError
         When the camera is not calibrated.
     """
@@ -87,11 +93,34 @@ def open_recording(
     options = options or RecordingOptions()
     with named_faults(RecordingError, paths[0]):
         source = _open(paths, config, options)
-    source.info = with_rig(source.info, options.rig)
+    source.info = as_asked(source.info, config, options)
     return source
 
 
-def _open(paths: Sequence[Path], config: Config, options: RecordingOptions) -> _Source:
+def as_asked(info: RecordingInfo, config: Config, options: RecordingOptions) -> RecordingInfo:
+    """Return what is known of a recording, with the masks and the rig that are asked for."""
+    return with_rig(_with_masks(info, config, options), options.rig)
+
+
+def _with_masks(info: RecordingInfo, config: Config, options: RecordingOptions) -> RecordingInfo:
+    """Return what is known of a recording with the masks that are asked for."""
+    paths = options.mask or tuple(map(Path, config.images.mask))
+    cameras = info.calibrations
+    if not paths:
+        return info
+    if len(paths) > len(cameras):
+        raise RecordingError(
+            f"{paths[-1]}: a {info.sensor} recording takes {len(cameras)} --mask, got {len(paths)}"
+        )
+    files = paths * (len(cameras) // len(paths))
+    masks = [
+        read_mask(path, camera.width, camera.height)
+        for path, camera in zip(files, cameras, strict=True)
+    ]
+    return replace(info, masks=tuple(masks))
+
+
+def _open(paths: Sequence[Path], config: Config, options: RecordingOptions) -> _Opened:
     for one in paths:
         if fault := access_fault(one):
             raise RecordingError(f"{one}: {fault}; {_KINDS}")
@@ -124,7 +153,7 @@ def refuse_topics(options: TopicChoice, where: str | Path) -> None:
             )
 
 
-def _open_folder(path: Path, config: Config, options: RecordingOptions) -> _Source:
+def _open_folder(path: Path, config: Config, options: RecordingOptions) -> _Opened:
     refuse_topics(options, path)
     if _is_kitti(path):
         return KittiSource(path, calibration=options.calibration, config=config)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gvo.geometry.camera import Calibration, PinholeCamera, StereoCamera, stereo_camera
 from gvo.geometry.rig import LearntRig
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import FloatArray
+from gvo.types import FloatArray, ImageArray
 
 Sensor = Literal["stereo", "rgbd"]
 
@@ -91,6 +91,8 @@ class RecordingInfo:
         Maps the rectified camera to the body the calibration names, metres.
     rig : LearntRig, optional
         What an earlier run learnt of the camera.
+    masks : tuple of ndarray of uint8, shape (h, w)
+        Of the raw left and right images, or of the colour images: 0 = not used; empty for none.
     """
 
     name: str
@@ -102,6 +104,7 @@ class RecordingInfo:
     frame_id: str = ""
     T_body_cam: FloatArray | None = None
     rig: LearntRig | None = None
+    masks: tuple[ImageArray, ...] = ()
 
     def __repr__(self) -> str:
         """Return one line: name, sensor, number and size of the images."""

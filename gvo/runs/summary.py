@@ -129,8 +129,8 @@ def run_identity(
     """
     info, view = source.info, source.info.depth_view
     known = [*map(asdict, info.calibrations), view and asdict(view)]
-    if info.rig is not None:
-        known.append(asdict(info.rig))
+    known += [asdict(info.rig)] if info.rig is not None else []
+    known += [info.masks] if info.masks else []
     return {
         "version of gvo": __version__,
         "recording": {

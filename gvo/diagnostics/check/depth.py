@@ -227,7 +227,7 @@ def _check_corners(frames: Sequence[RgbdFrame], config: Config) -> Finding:
     """Count the corners that odometry can use: depth known, in range, away from steps."""
     counts = []
     for frame in frames:
-        corners = detect_corners(frame.image, config.klt.n_corners)
+        corners = detect_corners(frame.image, config.klt.n_corners, mask=frame.mask)
         counts.append(np.count_nonzero(sample_depth(frame.depth, corners, config.depth)[1]))
     typical, fewest = float(np.median(counts)), config.ransac.min_inliers
     text = f"{typical:.0f} per frame (median)"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import cv2
@@ -67,7 +67,9 @@ def check_images(samples: Sequence[Sample], config: Config) -> Iterator[Finding]
         ]
         yield from _check_exposure(name, images)
         yield from _check_sharpness(name, images)
-        yield from _check_texture(name, images, moving, config)
+        mask = _masks(usable[0].first)[index]
+        detect = partial(detect_corners, n_corners=config.klt.n_corners, mask=mask)
+        yield from _check_texture(name, images, moving, config, detect)
         if moving:
             yield check_frozen(name, moving)
         yield _check_torn(name, images)
@@ -80,6 +82,12 @@ def _grey_images(frame: Frame | FaultyFrame | None) -> tuple[ImageArray, ...]:
     if isinstance(frame, StereoFrame):
         return (frame.left, frame.right)
     return (frame.image,) if isinstance(frame, RgbdFrame) else ()
+
+
+def _masks(frame: Frame | FaultyFrame) -> tuple[ImageArray | None, ...]:
+    if isinstance(frame, StereoFrame):
+        return frame.mask, frame.right_mask
+    return (frame.mask,) if isinstance(frame, RgbdFrame) else ()
 
 
 def blur_sigma_px(image: ImageArray) -> float:
@@ -145,25 +153,27 @@ def _check_texture(
     images: Sequence[ImageArray],
     pairs: Sequence[tuple[ImageArray, ImageArray]],
     config: Config,
+    detect: Callable[[ImageArray], FloatArray],
 ) -> Iterator[Finding]:
-    n_corners = config.klt.n_corners
-    counts = [len(detect_corners(image, n_corners)) for image in images]
+    counts = [len(detect(image)) for image in images]
     yield measured(
         f"{name}: corners",
         float(np.median(counts)),
         fault_low=config.ransac.min_inliers,
-        text=f"{np.median(counts):.0f} median, {min(counts)} least of {n_corners}",
+        text=f"{np.median(counts):.0f} median, {min(counts)} least of {config.klt.n_corners}",
     )
     if not pairs:
         yield unknown(f"{name}: corners found again", "no two consecutive frames")
         return
-    share = float(np.median([_followed_share(pair, n_corners) for pair in pairs]))
+    share = float(np.median([_followed_share(pair, detect) for pair in pairs]))
     yield measured(f"{name}: corners found again", share, text=f"{share:.0%} in the next frame")
 
 
-def _followed_share(images: tuple[ImageArray, ImageArray], n_corners: int) -> float:
+def _followed_share(
+    images: tuple[ImageArray, ImageArray], detect: Callable[[ImageArray], FloatArray]
+) -> float:
     """Return the share of corners that Lucas-Kanade tracks to the next image and back."""
-    start = detect_corners(images[0], n_corners).astype(np.float32)
+    start = detect(images[0]).astype(np.float32)
     if len(start) == 0:
         return 0.0
     track = partial(cv2.calcOpticalFlowPyrLK, winSize=_WINDOW, maxLevel=_N_TRACK_LEVELS)

@@ -86,7 +86,7 @@ def _flow_px(sample: Sample, config: Config) -> float:
     if second is None or isinstance(first, FaultyFrame) or isinstance(second, FaultyFrame):
         return 0.0
     images = image_of(first), image_of(second)
-    corners = detect_corners(images[0], config.klt.n_corners)
+    corners = detect_corners(images[0], config.klt.n_corners, mask=first.mask)
     ends, is_found = track_pixels(images, corners, corners, n_levels=N_WIDE_LEVELS, is_checked=True)
     lengths = np.linalg.norm(ends - corners, axis=1)[is_found]
     return float(np.median(lengths)) if len(lengths) >= config.ransac.min_inliers else 0.0

@@ -10,7 +10,7 @@ import numpy as np
 from gvo.config import Config
 from gvo.diagnostics.explain.values import Corner, Registration, Sorting
 from gvo.frontend.features import FeatureExtractor
-from gvo.frontend.klt import image_of
+from gvo.frontend.klt import image_of, is_unmasked
 from gvo.frontend.matching import best_ratios
 from gvo.frontend.offsets import RigOffsets
 from gvo.frontend.rgbd import sample_depth
@@ -51,9 +51,9 @@ def explain_measured(
 
 def _sort_depths(frame: RgbdFrame, config: Config) -> Sorting:
     if config.frontend.kind == "klt":
-        pixels = detect_corners(frame.image, config.klt.n_corners)
+        pixels = detect_corners(frame.image, config.klt.n_corners, mask=frame.mask)
     else:
-        pixels = FeatureExtractor(config.features).extract(frame.image).keypoints
+        pixels = FeatureExtractor(config.features).extract(frame.image, frame.mask).keypoints
     depths, is_valid = sample_depth(frame.depth, pixels, config.depth)
     with np.errstate(invalid="ignore"):
         is_in_range = (depths >= config.depth.min_depth_m) & (depths <= config.depth.max_depth_m)
@@ -69,7 +69,7 @@ def _sort_corners(
     frame: StereoFrame, camera: StereoCamera, config: Config, offsets: RigOffsets
 ) -> Sorting:
     halves = halve(frame.left), halve(frame.right)
-    pixels = detect_corners(frame.left, config.klt.n_corners, half=halves[0])
+    pixels = detect_corners(frame.left, config.klt.n_corners, half=halves[0], mask=frame.mask)
     row_offsets_px = offsets.row_errors(pixels)
     found = measure_corners(
         (frame.left, frame.right),
@@ -85,6 +85,7 @@ def _sort_corners(
         "not found along the row": np.isfinite(disparities),
         "left and right unlike": found.are_reliable,
         "depth out of range": is_in_depth_range(corrected, camera, config.stereo),
+        "masked on the right": is_unmasked(frame, pixels, disparities),
     }
     partners = np.column_stack([pixels[:, 0] - disparities, pixels[:, 1] + row_offsets_px])
     return Sorting(tests=tests, pixels=pixels, partners=partners, values=disparities)
@@ -94,7 +95,10 @@ def _sort_matches(
     frame: StereoFrame, camera: StereoCamera, config: Config, offsets: RigOffsets
 ) -> Sorting:
     extractor, stereo = FeatureExtractor(config.features), config.stereo
-    left, right = extractor.extract(frame.left), extractor.extract(frame.right)
+    left, right = (
+        extractor.extract(frame.left, frame.mask),
+        extractor.extract(frame.right, frame.right_mask),
+    )
     in_range = candidate_pairs(left, right, camera, stereo)
     tried = compare_rows(left, right, in_range)
     pairs, n = match_stereo(left, right, camera, stereo), len(left)
