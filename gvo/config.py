@@ -403,8 +403,7 @@ def describe_configuration(config: Config, *, for_experts: bool = True) -> str:
 
 
 def _yaml(value: Value | tuple[str, ...]) -> str:
-    plain = [*value] if isinstance(value, tuple) else value
-    return str(yaml.safe_dump(plain, default_flow_style=None, width=math.inf).splitlines()[0])
+    return str(yaml.safe_dump(value, default_flow_style=None, width=math.inf).splitlines()[0])
 
 
 def is_expert(field: Any) -> bool:  # noqa: ANN401 - a field of pydantic's

@@ -20,6 +20,7 @@ BoolArray: TypeAlias = NDArray[np.bool_]
 ImageArray: TypeAlias = NDArray[np.uint8]
 DepthArray: TypeAlias = NDArray[np.float32]
 FrameId: TypeAlias = Hashable
+_Images: TypeAlias = tuple[NDArray[Any], NDArray[Any]]
 
 
 def _freeze(value: object, **shapes: tuple[int, ...]) -> None:
@@ -40,20 +41,13 @@ def _check_kernel(kernel: str | None) -> None:
         raise ValueError(f"kernel must be one of {get_args(Kernel)}, got {kernel!r}")
 
 
-def _check_mask(kind: str, image: ImageArray, mask: NDArray[Any] | None) -> None:
-    if mask is not None and (mask.dtype != np.uint8 or mask.shape != image.shape):
-        raise ValueError(
-            f"the mask of {kind} must be uint8 of shape {image.shape}, "
-            f"got {mask.dtype} {mask.shape}"
-        )
-
-
 def _check_images(
-    kind: str, stamp_ns: int, first: NDArray[Any], second: NDArray[Any], dtype: type
+    kind: str, stamp_ns: int, images: _Images, dtype: type, *masks: NDArray[Any] | None
 ) -> None:
+    first, second = images
     if not isinstance(stamp_ns, Integral):
         raise ValueError(f"the stamp of {kind} must be an int of nanoseconds, got {stamp_ns!r}")
-    for image in (first, second):
+    for image in images:
         if not isinstance(image, np.ndarray):
             raise ValueError(f"the images of {kind} must be arrays, got {type(image).__name__}")
     if first.ndim != 2 or first.shape != second.shape:
@@ -66,6 +60,11 @@ def _check_images(
             f"the images of {kind} must be uint8 and {np.dtype(dtype)}, "
             f"got {first.dtype} and {second.dtype}"
         )
+    for mask in masks:
+        if mask is not None and (mask.dtype != np.uint8 or mask.shape != first.shape):
+            raise ValueError(
+                f"a mask of {kind} must be uint8 of {first.shape}, got {mask.dtype} {mask.shape}"
+            )
 
 
 class Stamped(Protocol):
@@ -157,9 +156,8 @@ class StereoFrame:
 
     def __post_init__(self) -> None:
         """Check shapes and types once."""
-        _check_images("a stereo frame", self.stamp_ns, self.left, self.right, np.uint8)
-        for mask in (self.mask, self.right_mask):
-            _check_mask("a stereo frame", self.left, mask)
+        images, masks = (self.left, self.right), (self.mask, self.right_mask)
+        _check_images("a stereo frame", self.stamp_ns, images, np.uint8, *masks)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -188,8 +186,8 @@ class RgbdFrame:
 
     def __post_init__(self) -> None:
         """Check shapes and types once."""
-        _check_images("an RGB-D frame", self.stamp_ns, self.image, self.depth, np.float32)
-        _check_mask("an RGB-D frame", self.image, self.mask)
+        images = self.image, self.depth
+        _check_images("an RGB-D frame", self.stamp_ns, images, np.float32, self.mask)
         if self.mask is not None:
             depth = np.where(self.mask > 0, self.depth, np.float32(np.nan))
             object.__setattr__(self, "depth", depth)

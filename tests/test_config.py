@@ -8,7 +8,13 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gvo.config import Config, describe_configuration, load_configuration
+from gvo.config import (
+    Config,
+    describe_configuration,
+    list_parameters,
+    load_configuration,
+    values_by_name,
+)
 from gvo.errors import ConfigurationError
 
 
@@ -32,6 +38,17 @@ def test_a_file_sets_what_it_names(tmp_path: Path) -> None:
     assert config.window.size == 7
     assert config.depth.scale == 2000.0
     assert config.window.n_keyframes == Config().window.n_keyframes
+
+
+def test_masks_are_named_from_the_folder_of_the_file(tmp_path: Path) -> None:
+    path = write(tmp_path, "images:\n  mask: [left.png, /right.png]\n")
+    config = load_configuration(path)
+    assert config.images.mask == (str(tmp_path / "left.png"), "/right.png")
+    again = write(tmp_path, describe_configuration(config))
+    assert load_configuration(again) == config
+    assert values_by_name(config)["images.mask"] == f"{tmp_path / 'left.png'}, /right.png"
+    assert "images.mask" in refusal(settings=("images.mask=[1.png, 2.png, 3.png]",))
+    assert "mask" not in [each.key for each in list_parameters()["images"]]
 
 
 def test_settings_win_over_the_file_and_later_ones_over_earlier(tmp_path: Path) -> None:

@@ -67,14 +67,12 @@ def batch(
     asked, files = _sort_arguments(recordings, configs or [])
     variants = make_variants(files, opt.with_loops(set_, loops), sweep or [])
     found = find_recordings(asked)
-    calibrations, masks = (
-        tuple(path.absolute() for path in paths)
-        for paths in (paths_of(options.calibration), options.mask)
-    )
+    calibration = tuple(map(Path.absolute, paths_of(options.calibration)))
+    masks = tuple(map(Path.absolute, options.mask))
     batch_options = BatchOptions(
         recording=replace(
             options,
-            calibration=calibrations,
+            calibration=calibration,
             mask=masks,
             rig=None if options.rig is None else Path(options.rig).absolute(),
         ),

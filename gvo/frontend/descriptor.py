@@ -100,13 +100,11 @@ class DescriptorFrontend:
 
     def _extract_both(self, frame: StereoFrame) -> tuple[Features, Features]:
         first, second = self._extractors
+        left, right = (frame.left, frame.mask), (frame.right, frame.right_mask)
         if self._pool is None:
-            return (
-                first.extract(frame.left, frame.mask),
-                second.extract(frame.right, frame.right_mask),
-            )
-        pending = self._pool.submit(second.extract, frame.right, frame.right_mask)
-        return first.extract(frame.left, frame.mask), pending.result()
+            return first.extract(*left), second.extract(*right)
+        pending = self._pool.submit(second.extract, *right)
+        return first.extract(*left), pending.result()
 
     def _extract_rgbd(self, frame: RgbdFrame) -> DescriptorObservations:
         features = self._extractors[0].extract(frame.image, frame.mask)
@@ -167,6 +165,8 @@ class DescriptorFrontend:
         result = self._register(reference, current, prior)
         if isinstance(result, RelativePose):
             self.calibrated.accept(result, self._config, is_step=is_step(prior))
+            if is_step(prior):
+                self.rig_offsets.carried.note(result)
         return result
 
     def _register(
@@ -259,14 +259,15 @@ class DescriptorFrontend:
         config = self._config.temporal
         radius_px = (WIDE if is_wide else 1.0) * config.radius_px
         matches = match_temporal(reference, current, predicted, config, radius_px=radius_px)
-        measured = Correspondences.of(reference, current, matches)
-        return Measurements(
+        found = Correspondences.of(reference, current, matches)
+        measured = Measurements(
             frames=(reference, current),
-            uvd=(measured.reference_uvd, measured.current_uvd),
-            sigmas=(measured.reference_sigmas, measured.current_sigmas),
+            uvd=(found.reference_uvd, found.current_uvd),
+            sigmas=(found.reference_sigmas, found.current_sigmas),
             matches=matches,
             sigma_factor=_SIGMA_FACTOR,
         )
+        return self.rig_offsets.carried.drop(measured, self._config.ransac)
 
 
 def is_step(prior: MotionPrior | None) -> bool:

@@ -62,6 +62,8 @@ _MAX_ALIGN_PX = 3.0
 _WIDE = 1.5
 # By how much more corners of a lost camera are looked for.
 _DENSITY = 3
+# Median displacement of a step that tells which corners stay, riding with the camera.
+_TELLING_PX = 2.0
 # How tracks are found: over more levels of the pyramid; near the predicted pixels, without its
 # finest one; by alignment alone, where the prediction is that of poses that are known.
 _Search: TypeAlias = Literal["wide", "near", "aligned"]
@@ -124,6 +126,9 @@ class KltFrontend:
         corners = detect_corners(
             image_of(frame), n_corners, spacing_px=spacing_px, half=half, mask=frame.mask
         )
+        is_carried = self.rig_offsets.carried.holds(corners)
+        carried, corners = corners[is_carried], corners[~is_carried]
+        self.rig_offsets.carried.n_corners += len(carried)
         row_shifts_px = np.full(len(corners), np.nan)
         if isinstance(frame, StereoFrame):
             config, images = self._config.stereo, (frame.left, frame.right)
@@ -148,6 +153,7 @@ class KltFrontend:
             points_cam=self.camera.unproject_stereo(ideal[:, :2], ideal[:, 2]),
             n_keypoints=len(corners),
             row_shifts_px=row_shifts_px[is_valid],
+            carried=carried,
             templates=Templates.of(image_of(frame), uvd[:, :2]),
         )
 
@@ -178,6 +184,10 @@ class KltFrontend:
             self.calibrated.accept(result, self._config, is_step=is_step)
             if is_step:
                 corners = reference.corners
+                self.rig_offsets.carried.note(result)
+                if len(corners.carried) and (result.flow_px or 0.0) > _TELLING_PX:
+                    images = reference.image, current.image
+                    self.rig_offsets.carried.watch(images, corners.carried)
                 self.rig_offsets.note_rows(corners.uvd, corners.row_shifts_px)
         return result
 
@@ -344,7 +354,8 @@ class KltFrontend:
         note_step(reference, current, T_predicted)
         T = np.eye(4) if T_predicted is None else T_predicted
         expected = self.predict(T, reference, current)
-        return self._track(reference, current, expected, "wide" if is_wide else "near")
+        measured = self._track(reference, current, expected, "wide" if is_wide else "near")
+        return self.rig_offsets.carried.drop(measured, self._config.ransac)
 
     def _register_link(
         self, prior: MotionPrior, reference: KltReference, current: KltObservations
@@ -490,6 +501,8 @@ class KltCorners:
         Corners detected, measured or not.
     row_shifts_px : ndarray of float64, shape (n,)
         By how much their rows are larger in the right image; NaN where not measured.
+    carried : ndarray of float64, shape (m, 2)
+        Pixels of other corners, which ride with the camera.
     """
 
     uvd: FloatArray
@@ -498,6 +511,7 @@ class KltCorners:
     templates: Templates
     n_keypoints: int
     row_shifts_px: FloatArray
+    carried: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -658,14 +672,14 @@ class KltPlace:
 
 def is_unmasked(frame: StereoFrame, pixels: FloatArray, disparities: FloatArray) -> BoolArray:
     """Tell which pixels (n, 2) with these disparities no mask covers, left and right."""
-    shifts = np.column_stack([np.nan_to_num(disparities), np.zeros(len(pixels))])
-    views = zip((frame.mask, frame.right_mask), (pixels, pixels - shifts), strict=True)
+    rows, columns = np.rint(pixels[:, 1]).astype(np.int64), pixels[:, 0]
     is_used = np.ones(len(pixels), np.bool_)
-    for mask, places in views:
+    for mask, u in (
+        (frame.mask, columns),
+        (frame.right_mask, columns - np.nan_to_num(disparities)),
+    ):
         if mask is not None:
-            limits = mask.shape[1] - 1, mask.shape[0] - 1
-            u, v = np.clip(np.rint(places), 0, limits).astype(np.int64).T
-            is_used &= mask[v, u] > 0
+            is_used &= mask[rows, np.clip(np.rint(u), 0, mask.shape[1] - 1).astype(np.int64)] > 0
     return is_used
 
 

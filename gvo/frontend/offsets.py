@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gvo.config import Config
+from gvo.frontend.carried import CarriedView
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.refinement import Constants
 from gvo.geometry.rig import LENS, READOUT, ROWS, LearntRig
@@ -200,6 +201,8 @@ class RigOffsets:
         How long the readout may be, seconds: zero where it is known to take no time.
     waiting : list
         Links of the newest frame, which tell of the camera once the step after it is known.
+    carried : CarriedView
+        What rides with the camera, and is not used.
     chain_factor, window_factor : VarianceFactor
         Of the covariances of registrations where they are chained, and where they are smoothed:
         by loops of links and steps, and by the edges of one frame in the window.
@@ -214,6 +217,7 @@ class RigOffsets:
             self._held = self._rig.constants
         u, v = np.meshgrid(np.linspace(0, camera.width, 17), np.linspace(0, camera.height, 9))
         self._places = np.column_stack([u.ravel(), v.ravel(), np.zeros(u.size)])
+        self.carried = CarriedView(camera)
         self._grid = self.lens_fields(self._places)
         self._readout_ms = config.camera.readout_ms
         self.lens, self.rows = np.zeros(len(LENS)), np.zeros(len(ROWS))
@@ -344,13 +348,15 @@ class RigOffsets:
     def advance(self) -> None:
         """Apply what was noted since the last frame."""
         self._n_frames += 1
+        self.carried.advance()
         self._filter.advance()
         self._settle()
 
     def as_json(self) -> dict[str, float]:
         """Return by how much what is seen anywhere is off, as taken off, and the readout.
 
-        A readout with a sigma of 0 was given.
+        A readout with a sigma of 0 was given. Beside it, where there is something, how much of the
+        view rides with the camera, and how many corners were not used for that.
         """
         value, sigma = self.readout
         u, v, disparity = np.abs(np.einsum("k,kni->in", self.lens, self._grid))
@@ -360,7 +366,12 @@ class RigOffsets:
             "pixel_px": round(float(np.hypot(u, v).max()), 4),
             "row_px": round(float(np.abs(rows).max()), 4),
         }
-        return (offsets if self._is_stereo else {}) | {
+        carried = {
+            "carried_percent": round(100.0 * self.carried.share, 1),
+            "carried_corners": self.carried.n_corners,
+        }
+        told = (carried if self.carried.n_corners else {}) | (offsets if self._is_stereo else {})
+        return told | {
             "readout_ms": round(1e3 * value, 2),
             "readout_sigma_ms": round(1e3 * sigma, 2),
         }

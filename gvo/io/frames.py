@@ -33,8 +33,8 @@ _N_AHEAD = 2
 # What reading or decoding one image may raise besides, in a source of one's own as well.
 _LOAD_ERRORS = (OSError, MemoryError, ValueError, cv2.error)
 _Preparers: TypeAlias = tuple["ImagePreparer", "ImagePreparer"]
-_Masks: TypeAlias = tuple[ImageArray | None, ImageArray | None]
 Through: TypeAlias = Callable[[Iterator[Paired]], Iterator[Paired]]
+_Pair: TypeAlias = tuple[NDArray[Any], NDArray[Any]]
 _Prepared: TypeAlias = NDArray[Any] | str
 _Jobs: TypeAlias = Sequence[tuple[Callable[[], _Prepared], Future[_Prepared] | None]]
 _Started: TypeAlias = tuple[Paired, _Jobs]
@@ -141,7 +141,7 @@ def _decoded(
     items: Iterator[Paired], preparers: _Preparers, info: RecordingInfo, threads: int, n_ahead: int
 ) -> Iterator[Frame | FaultyFrame]:
     """Yield the frames of pairs, decoded ahead where there are other threads."""
-    finish = partial(_finish, sensor=info.sensor, masks=_masks_of(preparers))
+    finish = partial(_finish, make_frame=partial(_frame_of, info.sensor, preparers))
     is_alone = threads == 1
     n_ahead = 0 if is_alone else n_ahead
     started: deque[_Started] = deque()
@@ -162,7 +162,7 @@ def _decoded(
         yield from (finish(*each) for each in started)
 
 
-def _finish(item: Paired, jobs: _Jobs, sensor: Sensor, masks: _Masks) -> Frame | FaultyFrame:
+def _finish(item: Paired, jobs: _Jobs, make_frame: Callable[..., Frame]) -> Frame | FaultyFrame:
     if isinstance(item, FaultyFrame):
         return item
     # What no other thread has begun is done on this one, which would wait.
@@ -171,7 +171,7 @@ def _finish(item: Paired, jobs: _Jobs, sensor: Sensor, masks: _Masks) -> Frame |
     if isinstance(first, str) or isinstance(second, str):
         reasons = [each for each in (first, second) if isinstance(each, str)]
         return FaultyFrame(stamp_ns=item[0].stamp_ns, reason="; ".join(reasons))
-    return _frame_of(sensor, (item[0].stamp_ns, item[1].stamp_ns), first, second, masks)
+    return make_frame((item[0].stamp_ns, item[1].stamp_ns), (first, second))
 
 
 def _prepare(image: StampedImage, preparer: ImagePreparer, info: RecordingInfo) -> _Prepared:
@@ -185,19 +185,15 @@ def _prepare(image: StampedImage, preparer: ImagePreparer, info: RecordingInfo) 
 
 
 def _frame_of(
-    sensor: Sensor,
-    stamps_ns: tuple[int, int],
-    first: NDArray[Any],
-    second: NDArray[Any],
-    masks: _Masks,
+    sensor: Sensor, preparers: _Preparers, stamps_ns: tuple[int, int], images: _Pair
 ) -> Frame:
-    stamp_ns, depth_ns = stamps_ns
-    mask, right = masks
+    (stamp_ns, depth_ns), (first, second) = stamps_ns, images
+    mask, right = (prepare.mask for prepare in preparers)
     if sensor == "stereo":
-        return StereoFrame(stamp_ns=stamp_ns, left=first, right=second, mask=mask, right_mask=right)
-    return RgbdFrame(
-        stamp_ns=stamp_ns, image=first, depth=second, depth_stamp_ns=depth_ns, mask=mask
-    )
+        pair = {"left": first, "right": second}
+        return StereoFrame(stamp_ns=stamp_ns, **pair, mask=mask, right_mask=right)
+    pair = {"image": first, "depth": second}
+    return RgbdFrame(stamp_ns=stamp_ns, **pair, depth_stamp_ns=depth_ns, mask=mask)
 
 
 def refuse_repeats(
@@ -273,10 +269,6 @@ def make_preparers(info: RecordingInfo) -> _Preparers:
     if info.sensor == "stereo":
         return first, ImagePreparer(info.calibrations[1], mask=masks[1])
     return first, ImagePreparer(info.calibrations[0], is_depth=True, depth_view=info.depth_view)
-
-
-def _masks_of(preparers: _Preparers) -> _Masks:
-    return preparers[0].mask, preparers[1].mask
 
 
 class Rig:
@@ -356,10 +348,9 @@ class Rig:
         """
         if self.info.sensor == "rgbd":
             second = self._metres(np.asarray(second))
-        images = zip(self._preparers, (first, second), strict=True)
-        left, right = (prepare(image) for prepare, image in images)
-        masks = _masks_of(self._preparers)
-        return _frame_of(self.info.sensor, (stamp_ns, stamp_ns), left, right, masks)
+        left, right = self._preparers
+        stamps_ns, images = (stamp_ns, stamp_ns), (left(first), right(second))
+        return _frame_of(self.info.sensor, self._preparers, stamps_ns, images)
 
     def _metres(self, depth: NDArray[Any]) -> DepthArray:
         if depth.dtype.kind == "f":

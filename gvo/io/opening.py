@@ -113,10 +113,8 @@ def _with_masks(info: RecordingInfo, config: Config, options: RecordingOptions) 
             f"{paths[-1]}: a {info.sensor} recording takes {len(cameras)} --mask, got {len(paths)}"
         )
     files = paths * (len(cameras) // len(paths))
-    masks = [
-        read_mask(path, camera.width, camera.height)
-        for path, camera in zip(files, cameras, strict=True)
-    ]
+    pairs = zip(files, cameras, strict=True)
+    masks = [read_mask(path, camera.width, camera.height) for path, camera in pairs]
     return replace(info, masks=tuple(masks))
 
 

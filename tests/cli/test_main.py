@@ -5,6 +5,8 @@ import re
 import signal
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import yaml
 
@@ -239,6 +241,36 @@ def test_a_run_warns_of_a_calibration_that_changes(
         "gvo: warning: CameraInfo changes on the way (7 of /camera/color/camera_info): "
     )
     assert command("check", room_bag).out.count("7 of /camera/color/camera_info") == 1
+
+
+def test_run_and_check_take_masks_of_the_images_size(
+    command: Command, room_bag: Path, tmp_path: Path
+) -> None:
+    camera = gvo.open_recording(room_bag).info.camera
+    mask, other = tmp_path / "mask.png", tmp_path / "other.png"
+    for path, height in ((mask, camera.height), (other, 7)):
+        pixels = np.full((height, camera.width), 255, np.uint8)
+        pixels[: 4 * height // 5] = 0
+        assert cv2.imwrite(str(path), pixels)
+    short = ["--duration", "0.1"]
+    sizes = f"the mask has {camera.width}x7 pixels, the images {camera.width}x{camera.height}"
+    out = ["--out", tmp_path / "out", "--no-report", *short]
+    for arguments in (
+        ["run", room_bag, *out],
+        ["check", room_bag],
+        ["explain", room_bag, "--frame", "0"],
+    ):
+        assert sizes in refused(command(*arguments, "--mask", other))
+    counts = []
+    for name, options in (("a", ()), ("b", ("--mask", mask))):
+        folder = tmp_path / name
+        answer = command("run", room_bag, "--out", folder, "--no-report", *short, *options)
+        assert answer.code == 0
+        rows = (folder / "frames.csv").read_text().splitlines()
+        counts.append(
+            int(dict(zip(rows[0].split(","), rows[1].split(","), strict=True))["n_points"])
+        )
+    assert counts[1] < 0.7 * counts[0]
 
 
 def test_check_and_run_tell_of_a_calibration_for_images_of_another_size(

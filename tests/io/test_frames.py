@@ -2,6 +2,7 @@
 
 import json
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 from gvo.config import Config, RuntimeConfig, SyncConfig
 from gvo.errors import CalibrationError, RecordingError
 from gvo.geometry.camera import Calibration, StereoCamera
-from gvo.io.frames import Rig, frames, refuse_repeats
+from gvo.io.frames import Rig, frames, make_preparers, refuse_repeats
 from gvo.types import FaultyFrame, Frame, RgbdFrame, StereoFrame
 
 _THREADS = pytest.mark.parametrize("threads", [1, 2, 4])
@@ -88,6 +89,29 @@ def test_a_rig_makes_the_frames_that_a_recording_of_it_has(tiny: Any, tmp_path: 
     assert not np.array_equal(frame.left, cv2.cvtColor(images[0], cv2.COLOR_BGR2GRAY))
     np.testing.assert_array_equal(frame.left, expected.left)
     np.testing.assert_array_equal(frame.right, expected.right)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_masks_are_rectified_with_the_images(tiny: Any, tmp_path: Path, threads: int) -> None:
+    mask = np.full((32, 48), 255, dtype=np.uint8)
+    mask[:, :10] = 0
+    source = tiny.rgbd([(0, 7, tiny.texture(1)), (1, 7, tiny.depth(2))])
+    (bare,) = _read(source, threads)
+    assert bare.mask is None
+    held = replace(source, info=replace(source.info, masks=(mask,)))
+    (frame,) = _read(held, threads)
+    # Patches of corners reach five pixels beyond their middle.
+    np.testing.assert_array_equal(frame.mask[:, 14:16] > 0, [[False, True]] * 32)
+    assert np.isnan(frame.depth[:, :15]).all()
+    np.testing.assert_array_equal(frame.depth[:, 15:], bare.depth[:, 15:])
+    D = {"data": [0.5, 0.0, 0.0, 0.0, 0.0]}  # corners of the rectified image are outside of it
+    bent = Rig(_written(tmp_path / "rgb.yaml", tiny, distortion_coefficients=D), sensor="rgbd")
+    first, second = make_preparers(replace(bent.info, masks=(mask,)))
+    assert second.mask is None
+    assert first.mask is not None
+    assert not np.array_equal(first.mask, frame.mask)
+    assert first.mask[0, -1] == 255
+    assert first(np.full((32, 48), 200, np.uint8))[0, -1] == 0
 
 
 @pytest.mark.parametrize(("changes", "scale"), [({}, 1000.0), ({"depth_scale": 5000.0}, 5000.0)])

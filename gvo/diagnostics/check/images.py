@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 import cv2
@@ -67,9 +67,8 @@ def check_images(samples: Sequence[Sample], config: Config) -> Iterator[Finding]
         ]
         yield from _check_exposure(name, images)
         yield from _check_sharpness(name, images)
-        mask = _masks(usable[0].first)[index]
-        detect = partial(detect_corners, n_corners=config.klt.n_corners, mask=mask)
-        yield from _check_texture(name, images, moving, config, detect)
+        mask = getattr(usable[0].first, ("mask", "right_mask")[index])
+        yield from _check_texture(name, images, moving, config, mask)
         if moving:
             yield check_frozen(name, moving)
         yield _check_torn(name, images)
@@ -82,12 +81,6 @@ def _grey_images(frame: Frame | FaultyFrame | None) -> tuple[ImageArray, ...]:
     if isinstance(frame, StereoFrame):
         return (frame.left, frame.right)
     return (frame.image,) if isinstance(frame, RgbdFrame) else ()
-
-
-def _masks(frame: Frame | FaultyFrame) -> tuple[ImageArray | None, ...]:
-    if isinstance(frame, StereoFrame):
-        return frame.mask, frame.right_mask
-    return (frame.mask,) if isinstance(frame, RgbdFrame) else ()
 
 
 def blur_sigma_px(image: ImageArray) -> float:
@@ -153,8 +146,9 @@ def _check_texture(
     images: Sequence[ImageArray],
     pairs: Sequence[tuple[ImageArray, ImageArray]],
     config: Config,
-    detect: Callable[[ImageArray], FloatArray],
+    mask: ImageArray | None,
 ) -> Iterator[Finding]:
+    detect = partial(detect_corners, n_corners=config.klt.n_corners, mask=mask)
     counts = [len(detect(image)) for image in images]
     yield measured(
         f"{name}: corners",
@@ -165,15 +159,13 @@ def _check_texture(
     if not pairs:
         yield unknown(f"{name}: corners found again", "no two consecutive frames")
         return
-    share = float(np.median([_followed_share(pair, detect) for pair in pairs]))
+    share = float(np.median([_followed_share(pair, detect(pair[0])) for pair in pairs]))
     yield measured(f"{name}: corners found again", share, text=f"{share:.0%} in the next frame")
 
 
-def _followed_share(
-    images: tuple[ImageArray, ImageArray], detect: Callable[[ImageArray], FloatArray]
-) -> float:
+def _followed_share(images: tuple[ImageArray, ImageArray], corners: FloatArray) -> float:
     """Return the share of corners that Lucas-Kanade tracks to the next image and back."""
-    start = detect(images[0]).astype(np.float32)
+    start = corners.astype(np.float32)
     if len(start) == 0:
         return 0.0
     track = partial(cv2.calcOpticalFlowPyrLK, winSize=_WINDOW, maxLevel=_N_TRACK_LEVELS)

@@ -44,12 +44,12 @@ def explain_measured(
 ) -> Sorting:
     """Sort the keypoints by the tests of their matches in the right image, or of their depth."""
     if isinstance(frame, RgbdFrame):
-        return _sort_depths(frame, config)
+        return _sort_depths(frame, config, offsets)
     sort = _sort_corners if config.frontend.kind == "klt" else _sort_matches
     return sort(frame, camera, config, offsets)
 
 
-def _sort_depths(frame: RgbdFrame, config: Config) -> Sorting:
+def _sort_depths(frame: RgbdFrame, config: Config, offsets: RigOffsets) -> Sorting:
     if config.frontend.kind == "klt":
         pixels = detect_corners(frame.image, config.klt.n_corners, mask=frame.mask)
     else:
@@ -58,6 +58,7 @@ def _sort_depths(frame: RgbdFrame, config: Config) -> Sorting:
     with np.errstate(invalid="ignore"):
         is_in_range = (depths >= config.depth.min_depth_m) & (depths <= config.depth.max_depth_m)
     tests = {
+        "rides with the camera": ~offsets.carried.holds(pixels),
         "depth unknown": np.isfinite(depths),
         "depth out of range": is_in_range,
         "depth edge": is_valid,
@@ -82,6 +83,7 @@ def _sort_corners(
     disparities = found.disparities
     corrected = offsets.take_off(np.column_stack([pixels, disparities]))[:, 2]
     tests = {
+        "rides with the camera": ~offsets.carried.holds(pixels),
         "not found along the row": np.isfinite(disparities),
         "left and right unlike": found.are_reliable,
         "depth out of range": is_in_depth_range(corrected, camera, config.stereo),
@@ -95,10 +97,8 @@ def _sort_matches(
     frame: StereoFrame, camera: StereoCamera, config: Config, offsets: RigOffsets
 ) -> Sorting:
     extractor, stereo = FeatureExtractor(config.features), config.stereo
-    left, right = (
-        extractor.extract(frame.left, frame.mask),
-        extractor.extract(frame.right, frame.right_mask),
-    )
+    views = (frame.left, frame.mask), (frame.right, frame.right_mask)
+    left, right = (extractor.extract(*view) for view in views)
     in_range = candidate_pairs(left, right, camera, stereo)
     tried = compare_rows(left, right, in_range)
     pairs, n = match_stereo(left, right, camera, stereo), len(left)

@@ -25,13 +25,17 @@ def verdict(summary: Mapping[str, Any]) -> str:
     """Say how far a run came, how good it is, and what is likely wrong, from its `summary.json`."""
     best = _best(summary)
     causes = [] if best is None else likely_causes(best, sensor=summary.get("sensor", ""))
-    looks = [*_looks_at_frames(summary), *_looks_at_camera(summary.get("rig_offsets") or {})]
+    offsets = summary.get("rig_offsets") or {}
+    looks = [*_looks_at_frames(summary), *_looks_at_camera(offsets)]
+    n_carried, percent = offsets.get("carried_corners"), offsets.get("carried_percent")
     sure = _how_sure(summary)
     sentences = [
         "; ".join(filter(None, [_how_far(summary), _how_good(summary)])),
         causes and f"Likely cause: {'; '.join(causes)}",
         looks and f"Worth a look: {'; '.join(looks)}",
         sure and f"Covariances {sure}",
+        n_carried
+        and f"{percent:.0f} % of the view rides with the camera ({n_carried} corners): not used",
     ]
     return " ".join(f"{sentence}." for sentence in sentences if sentence)
 

@@ -175,6 +175,11 @@ def test_the_verdict_names_what_was_learnt(offsets: dict[str, Any], looks: list[
     assert after == (f" Worth a look: {text}. Covariances fit." if looks else " Covariances fit.")
 
 
+def test_the_verdict_says_what_rides_with_the_camera() -> None:
+    said = verdict(summary(rig_offsets={"carried_percent": 23.4, "carried_corners": 812}))
+    assert said.endswith("23 % of the view rides with the camera (812 corners): not used.")
+
+
 SAME = "global is smoothed"
 
 
