@@ -78,8 +78,8 @@ class ImagesConfig(Section):
     white: int = _common(
         65535, "smallest value mapped to white; 4095 for a camera of 12 bits", ge=1, le=65535
     )
-    mask: tuple[str, ...] = _common(
-        (),
+    mask: list[str] = _common(
+        [],
         "files of masks as for --mask, from this one's folder: [both], or [left, right]",
         max_length=2,
     )
@@ -363,7 +363,7 @@ def _explain(error: ValidationError) -> str:
 def values_by_name(config: Config) -> dict[str, Value]:
     """Return the values of all parameters by `section.key`."""
     return {
-        f"{section}.{key}": ", ".join(value) if isinstance(value, tuple) else value
+        f"{section}.{key}": ", ".join(value) if isinstance(value, list) else value
         for section, values in config.model_dump().items()
         for key, value in values.items()
     }
@@ -402,7 +402,7 @@ def describe_configuration(config: Config, *, for_experts: bool = True) -> str:
     return "\n".join(lines[1:]) + "\n"
 
 
-def _yaml(value: Value | tuple[str, ...]) -> str:
+def _yaml(value: Value | list[str]) -> str:
     return str(yaml.safe_dump(value, default_flow_style=None, width=math.inf).splitlines()[0])
 
 
@@ -418,7 +418,7 @@ def describe_field(field: Any) -> str:  # noqa: ANN401 - a field of pydantic's
 
 
 def _choices(field: Any) -> str:  # noqa: ANN401
-    choices = [each for each in get_args(field.annotation) if each is not Ellipsis]
+    choices = getattr(field.annotation, "__args__", ())
     if choices and all(isinstance(choice, str) for choice in choices):
         return " | ".join(choices)
     return ", ".join(f"{sign} {limit:g}" for sign, limit in _limits(field).items())
@@ -480,7 +480,7 @@ def list_parameters() -> dict[str, list[Parameter]]:
         section: [
             _shown(section, key, field)
             for key, field in model.model_fields.items()
-            if not isinstance(field.default, tuple)
+            if not isinstance(field.default, list)
         ]
         for section, model in sections().items()
     }

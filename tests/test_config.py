@@ -43,7 +43,7 @@ def test_a_file_sets_what_it_names(tmp_path: Path) -> None:
 def test_masks_are_named_from_the_folder_of_the_file(tmp_path: Path) -> None:
     path = write(tmp_path, "images:\n  mask: [left.png, /right.png]\n")
     config = load_configuration(path)
-    assert config.images.mask == (str(tmp_path / "left.png"), "/right.png")
+    assert config.images.mask == [str(tmp_path / "left.png"), "/right.png"]
     again = write(tmp_path, describe_configuration(config))
     assert load_configuration(again) == config
     assert values_by_name(config)["images.mask"] == f"{tmp_path / 'left.png'}, /right.png"
