@@ -27,8 +27,9 @@ if TYPE_CHECKING:
     from gvo.frontend.rig import Measurements
 
 _N_COLUMNS = 32
-# Largest displacement of what stays, and smallest of what moves, pixels.
-_REST_PX, _MOVING_PX = 0.3, 1.0
+# Largest displacement of what stays, smallest of what moves, and smallest distance of what stays
+# from where the motion of the rest would have it, pixels.
+_REST_PX, _MOVING_PX, _APART_PX = 0.3, 0.7, 1.0
 # Tracks that ride, at least, and their share of those that stay though they should not. What the
 # rest must have more of: the view, times the relief, disparities of nine tenths by one.
 _MIN_TRACKS, _MIN_SHARE, _MIN_WORLD = 10, 0.8, 1.5
@@ -102,6 +103,7 @@ class CarriedView:
         if isinstance(found, Failure) or 2 * np.count_nonzero(found.inliers) < len(moves):
             return none
         T, world = found.T_reference_current[np.newaxis], moves[found.inliers]
+        config = config.model_copy(update={"inlier_threshold_px": _APART_PX})
         stays &= ~find_inliers(T, tracks, self._camera, config)[0]
         low, middle, high = np.quantile(first[world, 2], [0.1, 0.5, 0.9])
         rides &= stays & (first[:, 2] > middle)

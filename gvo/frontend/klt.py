@@ -63,7 +63,7 @@ _WIDE = 1.5
 # By how much more corners of a lost camera are looked for.
 _DENSITY = 3
 # Median displacement of a step that tells which corners stay, riding with the camera.
-_TELLING_PX = 2.0
+_TELLING_PX = 1.0
 # How tracks are found: over more levels of the pyramid; near the predicted pixels, without its
 # finest one; by alignment alone, where the prediction is that of poses that are known.
 _Search: TypeAlias = Literal["wide", "near", "aligned"]
