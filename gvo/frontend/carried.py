@@ -36,6 +36,8 @@ _MIN_TRACKS, _MIN_SHARE, _MIN_WORLD = 10, 0.8, 1.5
 # Steps in favour of a cell: that count, at most; by which it is sure; that one against it undoes.
 _MAX_VOTES, _SURE, _UNDONE = 6, 3, 2
 
+_NOWHERE: FloatArray = np.zeros((0, 2))
+
 
 class CarriedView:
     """Cells of the image that show what rides with the camera.
@@ -48,8 +50,6 @@ class CarriedView:
 
     Attributes
     ----------
-    share : float
-        Of the view, that surely rides with the camera.
     n_corners : int
         Corners that were not used so far.
     """
@@ -60,16 +60,22 @@ class CarriedView:
         # How many steps say that a cell rides with the camera; where corners moved with the world.
         self._votes, self._is_world = np.zeros(n_cells, np.int64), np.zeros(n_cells, np.bool_)
         self._next = self._votes, self._is_world
-        self._riding = np.zeros((0, 2))  # where tracks of the last step ride with the camera
-        self.share, self.n_corners = 0.0, 0
+        self._riding = _NOWHERE  # where tracks of the last step ride with the camera
+        self.n_corners = 0
+
+    @property
+    def share(self) -> float:
+        """The share of the view that surely rides with the camera."""
+        return float(np.mean(self._votes >= _SURE))
 
     def advance(self) -> None:
         """Apply what was noted since the last frame."""
         self._votes, self._is_world = self._next
-        self.share = float(np.mean(self._votes >= _SURE))
 
     def holds(self, pixels: FloatArray) -> BoolArray:
         """Tell which pixels (n, 2) are not to be used."""
+        if not self._votes.any():
+            return np.zeros(len(pixels), np.bool_)
         return np.asarray(self._votes[self._cells(pixels)] > 0)
 
     def _cells(self, pixels: FloatArray) -> IntArray:
@@ -79,47 +85,48 @@ class CarriedView:
     def drop(self, measured: Measurements, config: RansacConfig) -> Measurements:
         """Return the tracks of a step without those that ride with the camera."""
         rides = self._find(measured, config)
-        self._riding = measured.uvd[0][rides]
+        self._riding = _NOWHERE if rides is None else measured.uvd[0][rides]
+        if rides is None:
+            return measured
         self.n_corners += len(self._riding)
-        return replace(
-            measured,
-            uvd=(measured.uvd[0][~rides], measured.uvd[1][~rides]),
-            sigmas=(measured.sigmas[0][~rides], measured.sigmas[1][~rides]),
-            matches=measured.matches[~rides],
-        )
+        uvd = measured.uvd[0][~rides], measured.uvd[1][~rides]
+        sigmas = measured.sigmas[0][~rides], measured.sigmas[1][~rides]
+        return replace(measured, uvd=uvd, sigmas=sigmas, matches=measured.matches[~rides])
 
-    def _find(self, measured: Measurements, config: RansacConfig) -> BoolArray:
+    def _find(self, measured: Measurements, config: RansacConfig) -> BoolArray | None:
         first, second = measured.uvd
         shifts_px = np.hypot(*(second - first)[:, :2].T)
         stays, moves = np.asarray(shifts_px < _REST_PX), np.flatnonzero(shifts_px > _MOVING_PX)
+        if min(int(np.count_nonzero(stays)), len(moves)) < _MIN_TRACKS:
+            return None
         cells = self._cells(first)
         rides: BoolArray = stays & ~self._is_world[cells]
-        none: BoolArray = np.zeros(len(first), np.bool_)
-        if min(int(np.count_nonzero(rides)), len(moves)) < _MIN_TRACKS:
-            return none
+        if np.count_nonzero(rides) < _MIN_TRACKS:
+            return None
         tracks = Correspondences.of_pixels(measured.uvd, measured.sigmas, self._camera)
         rng = np.random.default_rng([abs(stamp_ns) for stamp_ns in measured.stamps_ns])
         found = ransac_rigid(tracks.select(moves), self._camera, config, weights=None, rng=rng)
         if isinstance(found, Failure) or 2 * np.count_nonzero(found.inliers) < len(moves):
-            return none
+            return None
         T, world = found.T_reference_current[np.newaxis], moves[found.inliers]
         config = config.model_copy(update={"inlier_threshold_px": _APART_PX})
         stays &= ~find_inliers(T, tracks, self._camera, config)[0]
         low, middle, high = np.quantile(first[world, 2], [0.1, 0.5, 0.9])
         rides &= stays & (first[:, 2] > middle)
         if np.count_nonzero(rides) < max(_MIN_TRACKS, _MIN_SHARE * np.count_nonzero(stays)):
-            return none
+            return None
         n_world, n_riding = (len(np.unique(cells[each])) for each in (world, rides))
-        return rides if n_world * high > _MIN_WORLD * n_riding * low else none
+        return rides if n_world * high > _MIN_WORLD * n_riding * low else None
 
     def note(self, result: RelativePose) -> None:
         """Take what a step shows."""
         votes, is_world = self._next = self._votes.copy(), self._is_world.copy()
-        pixels = result.pixels_reference[result.inliers]
-        shifts_px = np.hypot(*(result.pixels_current[result.inliers] - pixels).T)
-        is_world[self._cells(pixels[shifts_px > _MOVING_PX])] = True
-        told = self._cells(self._riding)
-        votes[told], is_world[told] = np.maximum(votes[told], 1), False
+        shifts_px = np.hypot(*(result.pixels_current - result.pixels_reference).T)
+        moving = result.inliers & (shifts_px > _MOVING_PX)
+        is_world[self._cells(result.pixels_reference[moving])] = True
+        if len(self._riding):
+            told = self._cells(self._riding)
+            votes[told], is_world[told] = np.maximum(votes[told], 1), False
 
     def watch(self, images: tuple[ImageArray, ImageArray], corners: FloatArray) -> None:
         """Count the cells whose corners stay, of a step that moves the rest; those around are next.

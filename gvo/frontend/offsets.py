@@ -366,12 +366,13 @@ class RigOffsets:
             "pixel_px": round(float(np.hypot(u, v).max()), 4),
             "row_px": round(float(np.abs(rows).max()), 4),
         }
-        carried = {
-            "carried_percent": round(100.0 * self.carried.share, 1),
-            "carried_corners": self.carried.n_corners,
-        }
-        told = (carried if self.carried.n_corners else {}) | (offsets if self._is_stereo else {})
-        return told | {
-            "readout_ms": round(1e3 * value, 2),
-            "readout_sigma_ms": round(1e3 * sigma, 2),
-        }
+        percent, n_carried = round(100.0 * self.carried.share, 1), self.carried.n_corners
+        carried = {"carried_percent": percent, "carried_corners": n_carried} if n_carried else {}
+        return (
+            carried
+            | (offsets if self._is_stereo else {})
+            | {
+                "readout_ms": round(1e3 * value, 2),
+                "readout_sigma_ms": round(1e3 * sigma, 2),
+            }
+        )
