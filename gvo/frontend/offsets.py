@@ -14,7 +14,7 @@ from gvo.geometry.camera import StereoCamera
 from gvo.geometry.refinement import Constants
 from gvo.geometry.rig import LENS, READOUT, ROWS, LearntRig
 from gvo.kernels import lens as kernels
-from gvo.types import FloatArray
+from gvo.types import FloatArray, IntArray
 
 # Largest inflation of the sigmas of a registration by tracks: errors of near ones correlate.
 KLT_SIGMA_FACTOR = 2.4
@@ -29,6 +29,8 @@ _READOUT_RGBD_S = 0.02, 0.01
 _READOUT_STEREO_S = 0.0, 0.01
 # A readout that may be longer than this, in seconds, is reckoned with.
 _LEAST_READOUT_S = 0.005
+# A readout is reckoned with once images have told of it: its sigma is so much smaller.
+_TOLD = 0.8
 # Errors of registrations are correlated (the same walls, the same lens): their sigmas are too small
 # by this factor.
 _FACTOR = 3.0
@@ -75,6 +77,7 @@ class ConstantFilter:
         self, presumed: Mapping[str, tuple[float, float]], rig: LearntRig | None = None
     ) -> None:
         self.names = (*presumed,)
+        self._known: dict[tuple[str, ...], tuple[IntArray, tuple[IntArray, ...]]] = {}
         self.mean, sigmas = np.reshape([*presumed.values()], (-1, 2)).T
         self._prior = self._presumed = np.diag(sigmas**-2)
         self._prior_vector = self._prior @ self.mean
@@ -98,11 +101,15 @@ class ConstantFilter:
 
     def of(self, names: tuple[str, ...]) -> tuple[FloatArray, FloatArray]:
         """Return the means (k,) and the covariance (k, k) of some constants."""
-        places = self._places(names)
-        return self.mean[places], self.covariance[np.ix_(places, places)]
+        places, block = self._places(names)
+        return self.mean[places], self.covariance[block]
 
-    def _places(self, names: tuple[str, ...]) -> list[int]:
-        return [self.names.index(name) for name in names]
+    def _places(self, names: tuple[str, ...]) -> tuple[IntArray, tuple[IntArray, ...]]:
+        """Return where some constants are, and their block of a matrix."""
+        if names not in self._known:
+            places = np.array([self.names.index(name) for name in names])
+            self._known[names] = places, np.ix_(places, places)
+        return self._known[names]
 
     def note(
         self,
@@ -112,8 +119,8 @@ class ConstantFilter:
         used: FloatArray,
     ) -> None:
         """Take normal equations of what is left of some constants, after some were used."""
-        places = self._places(names)
-        self._told[np.ix_(places, places)] += information / _FACTOR**2
+        places, block = self._places(names)
+        self._told[block] += information / _FACTOR**2
         self._vector[places] += (information @ used + score) / _FACTOR**2
 
     def advance(self) -> None:
@@ -219,10 +226,14 @@ class RigOffsets:
         self._places = np.column_stack([u.ravel(), v.ravel(), np.zeros(u.size)])
         self.carried = CarriedView(camera)
         self._grid = self.lens_fields(self._places)
+        # Means over the image of the products of two fields.
+        self._products = np.einsum("jni,kni->jk", self._grid, self._grid) / len(self._places)
         self._readout_ms = config.camera.readout_ms
         self.lens, self.rows = np.zeros(len(LENS)), np.zeros(len(ROWS))
         self.readout = (1e-3 * (self._readout_ms or 0.0), 0.0)
-        self._filter = ConstantFilter(self._presume(), self._rig)
+        presumed = self._presume()
+        self._filter = ConstantFilter(presumed, self._rig)
+        self._presumed_s = presumed.get(READOUT, (0.0, 0.0))[1]
         # What was significant is so with a share of its information.
         self._gate = _GATE * math.sqrt(1.0 if self._rig is None else _KEPT)
         self._n_frames = 0
@@ -271,15 +282,16 @@ class RigOffsets:
         """Say what registrations take off, from now on."""
         if self._learns_lens:
             constants, _ = self._filter.of(LENS)
-            field = np.einsum("k,kni->ni", constants, self._grid)
-            size_px = math.sqrt(np.mean(np.sum(field**2, axis=1)))
+            size_px = math.sqrt(constants @ self._products @ constants)
             is_told = self._filter.significance(LENS) > self._gate and size_px > _FEIGNED_PX
             self.lens = (1.0 - _FEIGNED_PX / size_px) * constants if is_told else 0.0 * constants
             self.rows, _ = self._filter.of(ROWS)
         if self._readout_ms is None:
-            self.readout = (self._filter.learnt | {**self._held})[READOUT]
+            (value,), ((variance,),) = self._filter.of((READOUT,))
+            self.readout = self._held.get(READOUT, (float(value), math.sqrt(variance)))
         value, sigma = self.readout
         is_rolling = abs(value) > (self._gate if self._is_stereo else 1.0) * sigma
+        is_rolling &= self._readout_ms is not None or sigma < _TOLD * self._presumed_s
         self.readout_s = value if is_rolling else 0.0
         is_possible = is_rolling or abs(value) + sigma > _LEAST_READOUT_S
         self.possible_readout_s = math.hypot(self.readout_s, sigma) if is_possible else 0.0

@@ -417,9 +417,12 @@ class CalibratedCamera:
         for measured, result in links:
             if measured.frames[1] is not frame:
                 continue
-            fields = np.stack([self._offsets.lens_fields(uvd) for uvd in measured.uvd], axis=1)
-            by_name = {**dict(zip(LENS, fields, strict=True)), READOUT: self._by_readout(measured)}
-            sensitivities = {name: by_name[name] for name in names}
+            sensitivities = {}
+            if names[0] in LENS:
+                fields = np.stack([self._offsets.lens_fields(uvd) for uvd in measured.uvd], axis=1)
+                sensitivities = dict(zip(LENS, fields, strict=True))
+            if READOUT in names:
+                sensitivities[READOUT] = self._by_readout(measured)
             prepared = replace(self._corrected(measured), sensitivities=sensitivities)
             T = result.T_reference_current
             residuals = StereoResiduals.of(T, prepared, self._camera)

@@ -128,7 +128,7 @@ def run_identity(
         Values that are the same after writing and reading JSON.
     """
     info, view = source.info, source.info.depth_view
-    known = [*map(asdict, info.calibrations), view and asdict(view)]
+    known: list[object] = [*map(asdict, info.calibrations), view and asdict(view)]
     known += [asdict(info.rig)] if info.rig is not None else []
     known += [info.masks] if info.masks else []
     return {

@@ -170,9 +170,9 @@ def test_what_is_not_known_yet_of_the_camera_is_doubted_in_the_covariance() -> N
     covariances = []
     for sigma_s in (0.0, 1e-5, 2e-5):
         learning = frontend("stereo", camera={"readout_ms": 0.0})
-        seen = [learning.extract(frame) for frame in frames("stereo")[:2]]
+        first, second = (learning.extract(frame) for frame in frames("stereo")[:2])
         learning.rig_offsets.readout = 0.0, sigma_s
-        result = learning.register(*seen)
+        result = learning.register(first, second)
         assert isinstance(result, RelativePose)
         covariances.append(result.covariance)
     small, medium, large = covariances

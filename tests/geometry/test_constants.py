@@ -1,5 +1,6 @@
 """Errors of a camera's constants, planted in simulated matches and found again."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -44,7 +45,7 @@ def drive(seed: int, offset_px: float, *, noise: float = 1.0) -> tuple[FloatArra
 
 
 def measured(
-    reference_uvd: FloatArray, current_uvd: FloatArray, sensitivities: dict[str, FloatArray]
+    reference_uvd: FloatArray, current_uvd: FloatArray, sensitivities: Mapping[str, FloatArray]
 ) -> Correspondences:
     points = [unproject(uvd, CAMERA) for uvd in (reference_uvd, current_uvd)]
     matches = matched(
