@@ -41,10 +41,10 @@ def write_page(path: Path, template: str, **values: Any) -> None:  # noqa: ANN40
         path.write_text(page, encoding="utf-8", newline="\n")
 
 
-def part(name: str, *values: Any) -> Markup:  # noqa: ANN401 - any text
-    """Return a part of a page by the name of its macro in `parts.html`."""
-    template = _environment().get_template("parts.html")
-    return Markup(getattr(template.module, name)(*values))  # noqa: S704 - escaped by the macro
+def part(name: str, *values: Any) -> str:  # noqa: ANN401 - any text
+    """Return a part of the page in the browser by the name of its macro in `panels.html`."""
+    template = _environment().get_template("panels.html")
+    return str(getattr(template.module, name)(*values))
 
 
 @cache
