@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -85,18 +84,3 @@ def _yaml(value: Any) -> str:  # noqa: ANN401
     if isinstance(value, bool):
         return str(value).lower()
     return f"{value:g}" if isinstance(value, float) and abs(value) < 1e5 else str(value)
-
-
-def changes(
-    configuration: Mapping[str, Any], defaults: Mapping[str, Mapping[str, Any]]
-) -> dict[str, list[tuple[str, Any, bool, Any]]]:
-    """Return each parameter by section: key, value, whether it was changed, default."""
-    sections = {}
-    for name, section in configuration.items():
-        if isinstance(section, Mapping):
-            known = defaults.get(name, {})
-            sections[name] = [
-                (key, value, known.get(key, value) != value, known.get(key))
-                for key, value in section.items()
-            ]
-    return sections
