@@ -208,6 +208,17 @@ def _write_constants(T, point, sensitivities, k, camera, J, rows):
             rows[6 + c, i] = now[i] - moved
 
 
+@helper
+def _add_match(factors, root, rows, r, A, b):
+    """Whiten the rows of constants, and add all rows to the lower triangle of A, and to b."""
+    for c in range(6, len(rows)):
+        whiten(factors, root, rows[c])
+    for i in range(len(rows)):
+        b[i] += dot(rows[i], r)
+        for j in range(i + 1):
+            A[i, j] += dot(rows[i], rows[j])
+
+
 @kernel(
     *(Out("f8", 2), *_MATCHES, In("f8", 4), In("f8", 1), "f8"),
     *(Out("f8", 2), Out("f8", 1), Out("f8", 2)),
@@ -242,12 +253,7 @@ def eliminate_pose(
         if root == 0.0:
             return BEHIND
         _write_constants(T, points[k], sensitivities, k, camera, J, rows)
-        for c in range(n_constants):
-            whiten(factors[k], root, rows[6 + c])
-        for i in range(size):
-            b[i] += dot(rows[i], r)
-            for j in range(size):
-                A[i, j] += dot(rows[i], rows[j])
+        _add_match(factors[k], root, rows, r, A, b)
     factor = matrix(6, 6)
     copy(A, factor)
     if not factorize(factor):
@@ -257,13 +263,10 @@ def eliminate_pose(
             effects[c, i] = A[6 + c, i]
         substitute(factor, effects[c])
     for c in range(n_constants):
-        score[c] = b[6 + c]
-        for i in range(6):
-            score[c] -= effects[c, i] * b[i]
-        for d in range(n_constants):
-            information[c, d] = A[6 + c, 6 + d]
-            for i in range(6):
-                information[c, d] -= effects[c, i] * A[6 + d, i]
+        score[c] = b[6 + c] - dot(effects[c], b[:6])
+        for d in range(c + 1):
+            information[c, d] = A[6 + c, 6 + d] - dot(effects[c], A[6 + d, :6])
+            information[d, c] = information[c, d]
     return DONE
 
 
@@ -315,11 +318,7 @@ def adjust(
             for c in range(n_constants):
                 for m in range(3):
                     rows[6 + c, m] = constants[6 + c, m]
-                whiten(factors[k], root, rows[6 + c])
-            for i in range(size):
-                g[i] += dot(rows[i], r)
-                for j in range(size):
-                    H[i, j] += dot(rows[i], rows[j])
+            _add_match(factors[k], root, rows, r, H, g)
         for c in range(n_constants):
             H[6 + c, 6 + c] += weight
             g[6 + c] -= weight * values[c]
