@@ -388,7 +388,8 @@ def convert_(
     from gvo.io.convert.convert import convert
     from gvo.io.run_folder.line_file import check_new
 
-    opt.refuse("images are written as they were recorded", rig=options.rig)
+    why = "images are written as they were recorded"
+    opt.refuse(why, rig=options.rig, mask=options.mask)
     check_new(target)
     source = opt.open_source(recordings, parameters, options)
     with Work(f"{target} is not written; the same command begins anew") as work:
