@@ -21,7 +21,7 @@ _Id = TypeVar("_Id", bound=Hashable)
 LINK_GAIN = 2.0
 """Least number of steps since a keyframe was asked, times its score, at which it is linked: more
 links to the same keyframe would repeat its errors."""
-MIN_OVERLAP = 0.4
+MIN_OVERLAP = 0.2
 """Least score of a keyframe that is linked: of views that share less, few corners are found."""
 KEYFRAME_OVERLAP = 0.9
 """Largest score with every keyframe at which a frame becomes one: nine tenths in common say all."""

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gvo.backend.keyframe_policy import (
+    MIN_OVERLAP,
     choose_links,
     choose_released,
     choose_unseen,
@@ -120,7 +121,7 @@ def test_links_are_near_once_each_and_not_to_the_predecessor(
     scores: dict[int, float], n_links: int, exclude: int, n_steps: int
 ) -> None:
     chosen, spare = choose(scores, n_steps, n_links=n_links, exclude=exclude)
-    usable = {frame for frame, score in scores.items() if score >= 0.4} - {exclude}
+    usable = {frame for frame, score in scores.items() if score >= MIN_OVERLAP} - {exclude}
     assert len(chosen + spare) == len({*chosen, *spare}) == min(n_links - 1, len(usable))
     assert {*chosen, *spare} <= usable
     assert all(n_steps * scores[frame] >= 2.0 for frame in chosen)
@@ -140,10 +141,10 @@ def test_far_and_surplus_are_released(shares: list[float], n_keyframes: int, n_n
     )
     assert len(released) == len(set(released))
     remaining = {frame: score for frame, score in scores.items() if frame not in released}
-    assert all(score >= 0.4 for score in remaining.values())
-    n_near = sum(score >= 0.4 for score in shares)
+    assert all(score >= MIN_OVERLAP for score in remaining.values())
+    n_near = sum(score >= MIN_OVERLAP for score in shares)
     assert len(remaining) == min(n_near, max(n_keyframes - n_new, 0))
-    near_released = [scores[frame] for frame in released if scores[frame] >= 0.4]
+    near_released = [scores[frame] for frame in released if scores[frame] >= MIN_OVERLAP]
     assert max(near_released, default=0.0) <= min(remaining.values(), default=1.0)
 
 

@@ -72,7 +72,7 @@ def test_a_frame_without_points_overlaps_with_nothing() -> None:
 
 def test_a_keyframe_was_in_view_at_the_last_step_that_had_enough_in_common() -> None:
     kept = keyframes(7, 8)
-    kept.scores({7: np.eye(4), 8: shifted(dx=3.0)}, 5)
+    kept.scores({7: np.eye(4), 8: shifted(dx=3.9)}, 5)
     assert [kept.kept[ns].seen_at for ns in (7, 8)] == [5, 0]
 
 
