@@ -1,3 +1,5 @@
 """The `gvo` command."""
 
-from gvo.cli.main import main as main
+from gvo.cli.main import main
+
+__all__ = ["main"]

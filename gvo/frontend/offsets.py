@@ -1,4 +1,4 @@
-"""What is learnt of constants of a camera while it runs: its lens, its rows, its readout time."""
+"""What is learnt of constants of a camera while it runs: its lens, its rows, its exposure."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gvo.config import Config
 from gvo.frontend.carried import CarriedView
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.refinement import Constants
-from gvo.geometry.rig import LENS, READOUT, ROWS, LearntRig
+from gvo.geometry.rig import DELAY, LENS, READOUT, ROWS, LearntRig
 from gvo.kernels import lens as kernels
 from gvo.types import FloatArray, IntArray
 
@@ -27,6 +27,10 @@ _ROW_PRIOR_PX = 1.0
 # whose shutters hardly do, seconds.
 _READOUT_RGBD_S = 0.02, 0.01
 _READOUT_STEREO_S = 0.0, 0.01
+# Of the delay of right images, and what is less counts as none: cameras that are triggered together
+# differ by microseconds.
+_DELAY_S = 0.0, 0.02
+_LEAST_DELAY_S = 0.001
 # A readout that may be longer than this, in seconds, is reckoned with.
 _LEAST_READOUT_S = 0.005
 # A readout is reckoned with once images have told of it: its sigma is so much smaller.
@@ -99,15 +103,30 @@ class ConstantFilter:
         sigmas = np.sqrt(np.diag(self.covariance)).tolist()
         return dict(zip(self.names, zip(self.mean.tolist(), sigmas, strict=True), strict=True))
 
-    def of(self, names: tuple[str, ...]) -> tuple[FloatArray, FloatArray]:
-        """Return the means (k,) and the covariance (k, k) of some constants."""
-        places, block = self._places(names)
-        return self.mean[places], self.covariance[block]
+    def information(self, names: tuple[str, ...]) -> FloatArray:
+        """Return the information (k, k) of some constants that share none with the others."""
+        return np.asarray((self._prior + self._told)[self._places(names)[1]])
+
+    def of(
+        self, names: tuple[str, ...], *, absent: tuple[str, ...] = ()
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the means (k,) and the covariance (k, k) of some constants, others being zero."""
+        (places, block), (zeros, _) = self._places(names), self._places(absent)
+        if not absent:
+            return self.mean[places], self.covariance[block]
+        shared = self.covariance[np.ix_(places, zeros)]
+        gain = shared @ np.linalg.inv(self.covariance[np.ix_(zeros, zeros)])
+        return self.mean[places] - gain @ self.mean[zeros], self.covariance[block] - gain @ shared.T
+
+    def one(self, name: str) -> tuple[float, float]:
+        """Return mean and standard deviation of a constant."""
+        (mean,), ((variance,),) = self.of((name,))
+        return float(mean), math.sqrt(variance)
 
     def _places(self, names: tuple[str, ...]) -> tuple[IntArray, tuple[IntArray, ...]]:
         """Return where some constants are, and their block of a matrix."""
         if names not in self._known:
-            places = np.array([self.names.index(name) for name in names])
+            places = np.array([self.names.index(name) for name in names], dtype=np.int64)
             self._known[names] = places, np.ix_(places, places)
         return self._known[names]
 
@@ -129,11 +148,6 @@ class ConstantFilter:
         self.mean = np.asarray(self.covariance @ (self._prior_vector + self._vector))
         self._told *= 1.0 - 1.0 / _N_LASTING
         self._vector *= 1.0 - 1.0 / _N_LASTING
-
-    def significance(self, names: tuple[str, ...]) -> float:
-        """Return how far some constants are from zero, in sigmas."""
-        mean, covariance = self.of(names)
-        return math.sqrt(mean @ np.linalg.solve(covariance, mean))
 
 
 class VarianceFactor:
@@ -177,7 +191,7 @@ class VarianceFactor:
 
 
 class RigOffsets:
-    """What is learnt of a camera while it runs: its lens, its rows, its readout time.
+    """What is learnt of a camera while it runs: its lens, its rows, its exposure.
 
     Measurements take effect with `advance`, so that all registrations of one frame use the same
     values.
@@ -187,8 +201,8 @@ class RigOffsets:
     camera : StereoCamera
         With what was learnt of it before, if anything.
     config : Config
-        `stereo.estimate_offset`, else lens and rows stay as they were learnt before, and the
-        readout, too; `camera.readout_ms`, known or to be learnt.
+        `stereo.estimate_offset`, else all that was learnt before stays as it is;
+        `camera.readout_ms`, known or to be learnt.
     is_stereo : bool
         Of other sensors, whose depth is not that of their lens, the readout time alone is learnt.
 
@@ -199,6 +213,10 @@ class RigOffsets:
         twentieth of a pixel. So much is feigned by patches that hold more than one surface.
     rows : ndarray of float64, shape (6,)
         The constants `ROWS` that are taken off rows of the right image.
+    names : tuple of str
+        The constants that registrations tell, in this order.
+    delay_s : float
+        By how much later the right image is exposed, seconds, as it is reckoned with.
     readout_s : float
         The readout time that is reckoned with, seconds: zero where it may be zero. A global
         shutter is not to be bent by what is left of the noise.
@@ -218,10 +236,8 @@ class RigOffsets:
     def __init__(self, camera: StereoCamera, config: Config, *, is_stereo: bool = True) -> None:
         self._is_stereo, self._camera, self._rig = is_stereo, camera, camera.rig
         self._learns_lens = is_stereo and config.stereo.estimate_offset
-        # What was learnt before is held where lens and rows are not to be learnt.
-        self._held: Mapping[str, tuple[float, float]] = {}
-        if self._rig is not None and is_stereo and not self._learns_lens:
-            self._held = self._rig.constants
+        # What was learnt before is held where nothing is to be learnt.
+        self._held = camera.rig if is_stereo and not self._learns_lens else None
         u, v = np.meshgrid(np.linspace(0, camera.width, 17), np.linspace(0, camera.height, 9))
         self._places = np.column_stack([u.ravel(), v.ravel(), np.zeros(u.size)])
         self.carried = CarriedView(camera)
@@ -230,16 +246,21 @@ class RigOffsets:
         self._products = np.einsum("jni,kni->jk", self._grid, self._grid) / len(self._places)
         self._readout_ms = config.camera.readout_ms
         self.lens, self.rows = np.zeros(len(LENS)), np.zeros(len(ROWS))
-        self.readout = (1e-3 * (self._readout_ms or 0.0), 0.0)
+        self.delay_s, self.readout = 0.0, (1e-3 * (self._readout_ms or 0.0), 0.0)
         presumed = self._presume()
         self._filter = ConstantFilter(presumed, self._rig)
+        self.names = tuple(name for name in presumed if name not in ROWS)
         self._presumed_s = presumed.get(READOUT, (0.0, 0.0))[1]
         # What was significant is so with a share of its information.
         self._gate = _GATE * math.sqrt(1.0 if self._rig is None else _KEPT)
         self._n_frames = 0
         self.waiting: list[Any] = []
-        if self._rig is not None and self._held:
-            self.lens, self.rows = (self._rig.of(names)[0] for names in (LENS, ROWS))
+        if self._held is not None:
+            self.lens, self.rows, (self.delay_s,) = (
+                self._held.of(names)[0] for names in (LENS, ROWS, (DELAY,))
+            )
+            if self._readout_ms is None:
+                self.readout = self._held.constants.get(READOUT, self.readout)
         self._sigma_factor = math.nan
         self.reconfigure(config)
         self._settle()
@@ -255,20 +276,21 @@ class RigOffsets:
             reach = np.abs(self._row_fields(self._places)).max(axis=1)
             for name, reach_px in zip(ROWS, reach.tolist(), strict=True):
                 presumed[name] = 0.0, _ROW_PRIOR_PX / reach_px
-        if self._readout_ms is None:
+            presumed[DELAY] = _DELAY_S
+        if self._readout_ms is None and self._held is None:
             presumed[READOUT] = _READOUT_STEREO_S if self._is_stereo else _READOUT_RGBD_S
         return presumed
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """The constants that registrations tell, in this order."""
-        return tuple(name for name in self._filter.names if name not in ROWS)
+    def exposure(self) -> FloatArray:
+        """The readout time and the delay of right images that are reckoned with, seconds."""
+        return np.array([self.readout_s, self.delay_s])
 
     @property
     def learnt(self) -> LearntRig | None:
         """What was learnt, also by earlier runs; None where nothing is learnt."""
-        if self._held:
-            return self._rig
+        if self._held is not None:
+            return self._held
         if not self._filter.names:
             return None
         n_before = 0 if self._rig is None else self._rig.n_frames
@@ -280,21 +302,27 @@ class RigOffsets:
 
     def _settle(self) -> None:
         """Say what registrations take off, from now on."""
-        if self._learns_lens:
-            constants, _ = self._filter.of(LENS)
-            size_px = math.sqrt(constants @ self._products @ constants)
-            is_told = self._filter.significance(LENS) > self._gate and size_px > _FEIGNED_PX
-            self.lens = (1.0 - _FEIGNED_PX / size_px) * constants if is_told else 0.0 * constants
-            self.rows, _ = self._filter.of(ROWS)
-        if self._readout_ms is None:
-            (value,), ((variance,),) = self._filter.of((READOUT,))
-            self.readout = self._held.get(READOUT, (float(value), math.sqrt(variance)))
+        if READOUT in self.names:
+            self.readout = self._filter.one(READOUT)
         value, sigma = self.readout
         is_rolling = abs(value) > (self._gate if self._is_stereo else 1.0) * sigma
         is_rolling &= self._readout_ms is not None or sigma < _TOLD * self._presumed_s
         self.readout_s = value if is_rolling else 0.0
         is_possible = is_rolling or abs(value) + sigma > _LEAST_READOUT_S
         self.possible_readout_s = math.hypot(self.readout_s, sigma) if is_possible else 0.0
+        if not self._learns_lens:
+            return
+        value, sigma = self._filter.one(DELAY)
+        self.delay_s = value if abs(value) > max(self._gate * sigma, _LEAST_DELAY_S) else 0.0
+        self.rows, _ = self._filter.of(ROWS)
+        # Most pairs are exposed at once: where that is not sure to be otherwise, it is taken for
+        # certain, and the lens is learnt the better.
+        absent = () if self.delay_s else (DELAY,)
+        constants, covariance = self._filter.of(LENS, absent=absent)
+        size_px = math.sqrt(constants @ self._products @ constants)
+        significance = math.sqrt(constants @ np.linalg.solve(covariance, constants))
+        is_told = significance > self._gate and size_px > _FEIGNED_PX
+        self.lens = (1.0 - _FEIGNED_PX / size_px) * constants if is_told else 0.0 * constants
 
     def reconfigure(self, config: Config) -> None:
         """Forget the variance factors where another front-end states other covariances."""
@@ -329,13 +357,27 @@ class RigOffsets:
         kernels.write_row_errors(pixels, np.eye(len(ROWS)), self._camera.parameters, fields)
         return fields
 
+    def pixel_errors(self, places: FloatArray) -> FloatArray:
+        """Return by how much pixels at places (n, 3) are off, (n, 2), as far as it matters.
+
+        What a turn, another focal length or principal point explains hides in poses, or is not
+        observable: k1 alone would show the focal length that it bends.
+        """
+        camera, errors = self._camera, places - self.take_off(places)
+        x, y = (places[:, 0] - camera.cx) / camera.fx, (places[:, 1] - camera.cy) / camera.fy
+        one, none = np.ones_like(x), np.zeros_like(x)
+        along = np.column_stack([one, none, x, -y, 1.0 + x * x, x * y])
+        across = np.column_stack([none, one, y, x, x * y, 1.0 + y * y])
+        fields, wanted = np.concatenate([along, across]), errors[:, :2].T.ravel()
+        left = wanted - fields @ np.linalg.lstsq(fields, wanted, rcond=None)[0]
+        return np.asarray(left.reshape(2, -1).T)
+
     def note(self, told: Constants) -> None:
         """Take what a link tells of the constants, beside those that are taken off."""
-        if self._held:
-            return
-        used = [*self.lens] if self._learns_lens else []
-        used += [self.readout_s] if self._readout_ms is None else []
-        self._filter.note(self.names, told.information, told.score, np.array(used))
+        used = dict(zip(LENS, self.lens.tolist(), strict=True))
+        used |= {DELAY: self.delay_s, READOUT: self.readout_s}
+        values = np.array([used[name] for name in self.names])
+        self._filter.note(self.names, told.information, told.score, values)
 
     def note_rows(self, pixels: FloatArray, shifts_px: FloatArray) -> None:
         """Take by how much rows of the right image are larger at pixels (n, 2), as measured.
@@ -349,7 +391,7 @@ class RigOffsets:
         fields = self._row_fields(pixels[told])
         left = shifts_px[told] - self.rows @ fields
         step: FloatArray = np.zeros(len(ROWS))
-        known = np.linalg.inv(self._filter.of(ROWS)[1])
+        known = self._filter.information(ROWS)
         for _ in range(_N_ROW_STEPS):
             weights = 1.0 / (1.0 + ((left - step @ fields) / _ROW_KERNEL_PX) ** 2)
             weighted = fields * weights / _ROW_SIGMA_PX**2
@@ -365,18 +407,21 @@ class RigOffsets:
         self._settle()
 
     def as_json(self) -> dict[str, float]:
-        """Return by how much what is seen anywhere is off, as taken off, and the readout.
+        """Return by how much what is seen anywhere is off, as taken off, and the exposure.
 
-        A readout with a sigma of 0 was given. Beside it, where there is something, how much of the
-        view rides with the camera, and how many corners were not used for that.
+        Pixels less what no image tells, see `pixel_errors`. A readout with a sigma of 0 was given.
+        Beside it, where there is something, how much of the view rides with the camera, and how
+        many corners were not used for that.
         """
         value, sigma = self.readout
-        u, v, disparity = np.abs(np.einsum("k,kni->in", self.lens, self._grid))
+        disparity = (self._places - self.take_off(self._places))[:, 2]
+        pixels = self.pixel_errors(self._places)
         rows = self.row_errors(self._places)
         offsets = {
-            "disparity_px": round(float(disparity.max()), 4),
-            "pixel_px": round(float(np.hypot(u, v).max()), 4),
+            "disparity_px": round(float(np.abs(disparity).max()), 4),
+            "pixel_px": round(float(np.linalg.norm(pixels, axis=1).max()), 4),
             "row_px": round(float(np.abs(rows).max()), 4),
+            "delay_ms": round(1e3 * self.delay_s, 2),
         }
         percent, n_carried = round(100.0 * self.carried.share, 1), self.carried.n_corners
         carried = {"carried_percent": percent, "carried_corners": n_carried} if n_carried else {}

@@ -1,9 +1,9 @@
-"""Registration by a camera whose constants are learnt: lens, rows and readout time.
+"""Registration by a camera whose constants are learnt: lens, rows, and when pixels are exposed.
 
 What a calibration leaves changes smoothly over the image: points near and far, and at either side
 of the view, disagree about the motion. A rolling shutter exposes the rows of an image one after the
-other, which bends the world of a camera that moves. Links to keyframes tell of both; what they
-tell is held by `gvo.frontend.offsets`.
+other, which bends the world of a camera that moves; a right image that is exposed later bends its
+depth. Links to keyframes tell of all three; what they tell is held by `gvo.frontend.offsets`.
 
 References
 ----------
@@ -28,7 +28,7 @@ from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.ransac import find_inliers
 from gvo.geometry.refinement import Adjustment, adjust, eliminate_pose
 from gvo.geometry.residuals import StereoResiduals
-from gvo.geometry.rig import LENS, READOUT
+from gvo.geometry.rig import DELAY, LENS, READOUT
 from gvo.kernels import shutter
 from gvo.types import (
     Failure,
@@ -219,18 +219,18 @@ class CalibratedCamera:
     def correct(self, observations: Moving, uvd: FloatArray) -> FloatArray:
         """Return measured (u, v, disparity), shape (n, 3), as a camera without errors has them."""
         velocity, offsets = observations.motion.velocity, self._offsets
-        readout_s, settled = offsets.readout_s, np.empty_like(uvd)
+        exposure, settled = offsets.exposure, np.empty_like(uvd)
         if velocity is None:
-            velocity, readout_s = _AT_REST, 0.0
+            velocity, exposure = _AT_REST, np.zeros(2)
         camera = self._camera.parameters
-        shutter.settle_rows(uvd, offsets.lens, velocity, readout_s, camera, settled)
+        shutter.settle_rows(uvd, offsets.lens, velocity, exposure, camera, settled)
         return settled
 
-    def bends(self, reference: Moving, current: Moving) -> tuple[FloatArray, FloatArray, float]:
-        """Return what bends measurements: lens (11,), velocities (2, 6) of two frames, readout."""
+    def bends(self, reference: Moving, current: Moving) -> tuple[FloatArray, ...]:
+        """Return what bends measurements: lens, velocities (2, 6) of two frames, exposure."""
         velocities = [each.motion.velocity for each in (reference, current)]
         known = np.array([_AT_REST if each is None else each for each in velocities])
-        return self._offsets.lens, known, self._offsets.readout_s
+        return self._offsets.lens, known, self._offsets.exposure
 
     def register(
         self, measured: Measurements, config: Config, *, prior: MotionPrior | None, is_step: bool
@@ -271,14 +271,14 @@ class CalibratedCamera:
     ) -> FloatArray | None:
         """Take over the velocities of a step, estimated roughly; return its T_reference_current.
 
-        None where rows need no velocities; where that fails, the step is tried again as a whole, to
-        tell why.
+        None where the exposure needs no velocities; where that fails, the step is tried again as a
+        whole, to tell why.
         """
         frames = measured.frames
         # A first step has no velocity yet to start from.
         if not (is_step and frames[0].motion.velocity is not None):
             return None
-        if not self._offsets.possible_readout_s:
+        if not (self._offsets.possible_readout_s or self._offsets.delay_s):
             return None
         corrected, stamps_ns = self._corrected(measured), measured.stamps_ns
         T = estimate_roughly(corrected, self._camera, config, stamps_ns=stamps_ns, prior=prior)
@@ -390,7 +390,7 @@ class CalibratedCamera:
         corrected = self._corrected(measured)
         sensitivities, readout_sigma_s = {}, self._offsets.readout[1]
         if readout_sigma_s > 0.0:
-            sensitivities[READOUT] = readout_sigma_s * self._by_readout(measured)
+            sensitivities[READOUT] = readout_sigma_s * self._by_exposure(measured)[READOUT]
         sigmas = measured.frames[1].motion.sigmas
         # What a readout that is not known yet may do counts, too.
         readout_s = self._offsets.possible_readout_s
@@ -398,13 +398,13 @@ class CalibratedCamera:
             sensitivities |= self._by_velocity(corrected, sigmas, readout_s)
         return replace(corrected, sensitivities=sensitivities)
 
-    def _by_readout(self, measured: Measurements) -> FloatArray:
-        """Return the derivatives of corrected measurements by an error of the readout time."""
+    def _by_exposure(self, measured: Measurements) -> dict[str, FloatArray]:
+        """Return the derivatives of measurements by the readout time, and by the delay."""
         lens, velocities, _ = self.bends(*measured.frames)
-        rates, camera = np.empty((2, len(measured.matches), 3)), self._camera.parameters
-        for uvd, velocity, out in zip(measured.uvd, velocities, rates, strict=True):
-            shutter.write_readout_rates(uvd, lens, velocity, camera, out)
-        return -rates
+        errors, camera = np.empty((2, 2, len(measured.matches), 3)), self._camera.parameters
+        for uvd, velocity, out in zip(measured.uvd, velocities, errors, strict=True):
+            shutter.write_exposure_errors(uvd, lens, velocity, camera, out)
+        return dict(zip((READOUT, DELAY), np.swapaxes(errors, 0, 1), strict=True))
 
     def _learn(self, frame: Moving) -> None:
         """Take what the links of a frame tell of the camera, now that the step after it is known.
@@ -417,12 +417,11 @@ class CalibratedCamera:
         for measured, result in links:
             if measured.frames[1] is not frame:
                 continue
-            sensitivities = {}
+            found = self._by_exposure(measured)
             if names[0] in LENS:
                 fields = np.stack([self._offsets.lens_fields(uvd) for uvd in measured.uvd], axis=1)
-                sensitivities = dict(zip(LENS, fields, strict=True))
-            if READOUT in names:
-                sensitivities[READOUT] = self._by_readout(measured)
+                found |= zip(LENS, fields, strict=True)
+            sensitivities = {name: found[name] for name in names}
             prepared = replace(self._corrected(measured), sensitivities=sensitivities)
             T = result.T_reference_current
             residuals = StereoResiduals.of(T, prepared, self._camera)

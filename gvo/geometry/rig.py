@@ -16,6 +16,8 @@ ROWS = "r0", "rx", "ry", "rxx", "rxy", "ryy"
 """Constants of the rows of the right image."""
 READOUT = "readout_s"
 """The time that a rolling shutter takes from the first row of an image to the last."""
+DELAY = "delay_s"
+"""By how much later the right image is exposed than the left one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -25,8 +27,8 @@ class LearntRig:
     Parameters
     ----------
     constants : mapping of str to (float, float)
-        Value and standard deviation of some of `LENS`, `ROWS` and `READOUT`; pixels, focal lengths
-        and seconds.
+        Value and standard deviation of some of `LENS`, `ROWS`, `READOUT` and `DELAY`; pixels,
+        focal lengths and seconds.
     information : ndarray of float64, shape (k, k)
         What the images told of them, in their order: without what is presumed of any camera.
     n_frames : int
@@ -46,7 +48,7 @@ class LearntRig:
     def __post_init__(self) -> None:
         """Refuse what could not be used."""
         names, told = [*self.constants], self.information
-        if unknown := sorted({*names} - {*LENS, *ROWS, READOUT}):
+        if unknown := sorted({*names} - {*LENS, *ROWS, READOUT, DELAY}):
             raise CalibrationError(f"unknown constants {', '.join(unknown)}")
         if told.shape != (len(names), len(names)):
             raise CalibrationError(

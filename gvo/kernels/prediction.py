@@ -14,36 +14,35 @@ _MAX_SLOPE = 0.75
 
 
 @kernel(
-    *(In("f8", 2), In("f8", 2), Out("f8", 2), In("f8", 1), In("f8", 2), "f8", In("f8", 1)),
+    *(In("f8", 2), In("f8", 2), Out("f8", 2), In("f8", 1), In("f8", 2), In("f8", 1), In("f8", 1)),
     *(Out("i8", 1), Out("f8", 2), Out("f8", 3), Out("f8", 2)),
     returns="i8",
 )
-def predict(
-    uvd, slopes, T, lens, velocities, readout_s, camera, indices, seen, warps, moved_slopes
-):
+def predict(uvd, slopes, T, lens, velocities, exposure, camera, indices, seen, warps, moved_slopes):
     """Write which of n corners a motion brings into view, where, and how warped; return how many.
 
     Measurements (u, v, disparity) of the reference and the slopes of its disparities (n, 2); T is
     T_reference_current; the lens errors are in all of them; velocities (2, 6) of both frames bend
-    their rows. What is seen is what this camera measures, errors and rows included.
+    them, by the exposure. What is seen is what this camera measures, with all of its errors.
 
     The surface at a pixel is a plane: its inverse depth is linear in the pixel. Then a pixel x,
     in coordinates of the ray, goes to R x + t (n . x), divided by its third component, and the
     plane n . p = 1 becomes R n / (1 + t . R n), with R, t of T_current_reference.
     """
     fx, fy, cx, cy, baseline = camera[0], camera[1], camera[2], camera[3], camera[4]
+    readout_s, delay_s = exposure[0], exposure[1]
     # The reference's origin in the current camera.
     tx, ty, tz = seen_from(T, (0.0, 0.0, 0.0))
     n_seen = 0
     for k in range(len(uvd)):
         ideal = take_off(uvd[k], lens, camera)
-        u, v, settled = settle(ideal, velocities[0], readout_s, camera)
+        u, v, settled = settle(ideal, velocities[0], readout_s, delay_s, camera)
         z = fx * baseline / settled
         x, y, z = seen_from(T, ((u - cx) / fx * z, (v - cy) / fy * z, z))
         if not z > MIN_DEPTH_M:
             continue
         place = fx * x / z + cx, fy * y / z + cy, fx * baseline / z
-        moved = settle(place, velocities[1], -readout_s, camera)
+        moved = settle(place, velocities[1], -readout_s, -delay_s, camera)
         u, v, disparity = put_on(moved, lens, camera)
         if not (0.0 <= u <= camera[5] - 1.0 and 0.0 <= v <= camera[6] - 1.0):
             continue

@@ -23,7 +23,15 @@ def predicted(
     indices, seen, warps = np.empty(n, np.int64), np.empty((n, 3)), np.empty((n, 2, 2))
     moved = np.empty((n, 2))
     n_seen = predict(
-        *(uvd, slopes, T, np.eye(11)[0] * offset_px, np.zeros((2, 6)), 0.0, CAMERA.parameters),
+        *(
+            uvd,
+            slopes,
+            T,
+            np.eye(11)[0] * offset_px,
+            np.zeros((2, 6)),
+            np.zeros(2),
+            CAMERA.parameters,
+        ),
         *(indices, seen, warps, moved),
     )
     return indices[:n_seen], seen[:n_seen], warps[:n_seen], moved[:n_seen]

@@ -1,10 +1,10 @@
-"""A rolling shutter: points moved by the motion during the exposure, one by one."""
+"""When pixels are exposed: points moved by the motion in between, one by one."""
 
 import numpy as np
 import pytest
 
 from gvo.geometry import se3
-from gvo.kernels.shutter import settle_rows, write_readout_rates, write_velocity_errors
+from gvo.kernels.shutter import settle_rows, write_exposure_errors, write_velocity_errors
 from gvo.types import FloatArray
 from tests.geometry.scenes import CAMERA, derivative, project, unproject
 from tests.kernels.matches import PARAMETERS
@@ -19,9 +19,9 @@ def random_uvd(n: int) -> FloatArray:
     return np.random.default_rng(n).uniform([0.0, 0.0, 5.0], [640.0, 480.0, 50.0], size=(n, 3))
 
 
-def settled(uvd: FloatArray, readout_s: float = READOUT_S) -> FloatArray:
-    found = np.full_like(uvd, 7.0)
-    settle_rows(uvd + OFFSET, LENS, VELOCITY, readout_s, PARAMETERS, found)
+def settled(uvd: FloatArray, readout_s: float = READOUT_S, delay_s: float = 0.0) -> FloatArray:
+    found, exposure = np.full_like(uvd, 7.0), np.array([readout_s, delay_s])
+    settle_rows(uvd + OFFSET, LENS, VELOCITY, exposure, PARAMETERS, found)
     return found
 
 
@@ -56,7 +56,7 @@ def test_the_middle_row_stays_and_so_does_what_would_come_to_lie_behind() -> Non
         assert unproject(top)[0, 2] == pytest.approx(0.1)
         found = np.empty_like(top)
         forward = np.array([0.0, 0.0, 0.0, 0.0, 0.0, speed])
-        settle_rows(top, 0.0 * LENS, forward, 2.0, PARAMETERS, found)
+        settle_rows(top, 0.0 * LENS, forward, np.array([2.0, 0.0]), PARAMETERS, found)
         assert np.array_equal(found, top) != is_settled
 
 
@@ -70,19 +70,31 @@ def test_an_unknown_row_spoils_itself_alone() -> None:
 
 
 @pytest.mark.parametrize("n", [0, 1, 40])
-def test_readout_rates_are_derivatives_of_what_is_settled(n: int) -> None:
+def test_errors_of_the_exposure_are_derivatives_of_what_is_settled(n: int) -> None:
     uvd = random_uvd(n)
-    rates = np.full_like(uvd, 7.0)
-    measured = uvd + OFFSET
-    write_readout_rates(measured, LENS, VELOCITY, PARAMETERS, rates)
+    errors = np.full((2, n, 3), 7.0)
+    write_exposure_errors(uvd + OFFSET, LENS, VELOCITY, PARAMETERS, errors)
     points = unproject(uvd)
     motions = times(uvd)[:, np.newaxis] * rates_of(points)
     expected = [
         derivative(point)[:, 3:] @ motion for point, motion in zip(points, motions, strict=True)
     ]
-    np.testing.assert_allclose(rates, np.reshape(expected, (n, 3)), rtol=1e-9, atol=1e-9)
-    numerical = (settled(uvd, 1e-5) - settled(uvd, -1e-5)) / 2e-5
-    np.testing.assert_allclose(rates, numerical, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(errors[0], -np.reshape(expected, (n, 3)), rtol=1e-9, atol=1e-9)
+    for by_unit, step in zip(errors, 1e-5 * np.eye(2), strict=True):
+        numerical = (settled(uvd, *-step) - settled(uvd, *step)) / 2e-5
+        np.testing.assert_allclose(by_unit, numerical, rtol=1e-4, atol=1e-4)
+
+
+def test_a_right_image_is_settled_as_if_exposed_with_the_left_one() -> None:
+    ideal, late_s = random_uvd(60), 0.005
+    until_late = se3.invert(se3.exp(late_s * VELOCITY))
+    later = project(unproject(ideal) @ until_late[:3, :3].T + until_late[:3, 3])
+    measured = ideal.copy()
+    measured[:, 2] = ideal[:, 0] - (later[:, 0] - later[:, 2])
+    assert np.median(np.abs(measured - ideal)[:, 2]) > 0.5
+    # Right to first order.
+    left = settled(measured, 0.0, late_s) - ideal
+    assert np.abs(left).max() < 0.03 * np.abs(measured - ideal).max()
 
 
 @pytest.mark.parametrize("n", [0, 1, 20])

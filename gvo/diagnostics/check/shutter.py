@@ -1,9 +1,9 @@
-"""Whether a rolling shutter reads out row after row, by what odometry learns of it."""
+"""When pixels are exposed, by what odometry learns: a rolling shutter, and a right image late."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from itertools import takewhile
 
@@ -15,6 +15,7 @@ from gvo.diagnostics.check.sampling import Sample, Survey
 from gvo.errors import GvoError
 from gvo.frontend.klt import image_of
 from gvo.frontend.tracking import N_WIDE_LEVELS, detect_corners, track_pixels
+from gvo.geometry.rig import DELAY, READOUT
 from gvo.io.frames import frames
 from gvo.io.recording import ChosenImages, Source, StampedImage
 from gvo.odometry.odometry import Odometry
@@ -25,9 +26,9 @@ _N_PARTS = 3
 _N_FRAMES = 30
 # Images of a stream may come so much later than those of the other.
 _DELAY_NS = 1_000_000_000
-# A readout of a larger sigma is not told.
+# A time of a larger sigma is not told.
 _MAX_SIGMA_MS = 4.0
-# A given readout is wrong if it differs by more sigmas, and by more milliseconds, than these.
+# A time is not as it should be if it differs by more sigmas, and milliseconds, than these.
 _N_SIGMAS = 3.0
 _MIN_DIFFERENCE_MS = 2.0
 # Lower than in a run: more links measure the readout better, even if poses gain little by them.
@@ -35,34 +36,54 @@ _LINK_GAIN = 0.5
 
 
 def check_shutter(source: Source, found: Survey, config: Config) -> Iterator[Finding]:
-    """Yield the readout time of the camera; nothing where the recording does not tell it.
+    """Yield the readout time of the camera and the delay of right images, those that are told.
 
     Odometry runs over three parts of 30 frames, around the samples that move most.
     """
     parts = _choose_parts(found, config)
     learnt = [] if not parts else _learn(source, parts, config)
-    if not learnt:
-        return
-    values_ms, sigmas_ms = np.transpose(learnt)
+    delay, readout = _mean_ms(learnt, DELAY), _mean_ms(learnt, READOUT)
+    if delay is not None:
+        limit_ms = max(_N_SIGMAS * delay[1], _MIN_DIFFERENCE_MS)
+        is_late = abs(delay[0]) > limit_ms
+        yield Finding(
+            name="left/right: trigger",
+            value=delay[0],
+            unit="ms",
+            text=f"right images {delay[0]:+z.1f} ms later, sigma {delay[1]:.1f}",
+            threshold=f"+/- {limit_ms:.1f} ms",
+            verdict="warning" if is_late else "ok",
+            fix="trigger both at once: odometry corrects most of it, not all" if is_late else "",
+        )
+    if readout is not None:
+        limit_ms = max(_N_SIGMAS * readout[1], _MIN_DIFFERENCE_MS)
+        given_ms = config.camera.readout_ms
+        is_wrong = given_ms is not None and abs(readout[0] - given_ms) > limit_ms
+        yield Finding(
+            name="rolling shutter",
+            value=readout[0],
+            unit="ms",
+            text=f"readout {readout[0]:z.1f} ms, sigma {readout[1]:.1f}",
+            threshold="" if given_ms is None else f"{given_ms:g} +/- {limit_ms:.1f} ms",
+            verdict="warning" if is_wrong else "info" if given_ms is None else "ok",
+            fix="--set camera.readout_ms=null learns it" if is_wrong else "",
+        )
+
+
+def _mean_ms(
+    learnt: Sequence[Mapping[str, tuple[float, float]]], name: str
+) -> tuple[float, float] | None:
+    """Return what parts learnt of a time, and its sigma, milliseconds; None: too little."""
+    told = [constants[name] for constants in learnt if name in constants]
+    if not told:
+        return None
+    values_ms, sigmas_ms = 1e3 * np.transpose(told)
     weights = sigmas_ms**-2.0
-    found_ms = float(np.average(values_ms, weights=weights))
+    mean_ms = float(np.average(values_ms, weights=weights))
     # The sigma of the mean is not below what the scatter of the parts says.
-    chi2 = float(np.sum(weights * (values_ms - found_ms) ** 2)) / max(len(learnt) - 1, 1)
+    chi2 = float(np.sum(weights * (values_ms - mean_ms) ** 2)) / max(len(told) - 1, 1)
     sigma_ms = math.sqrt(max(chi2, 1.0) / weights.sum())
-    if sigma_ms > _MAX_SIGMA_MS:
-        return
-    given_ms = config.camera.readout_ms
-    limit_ms = max(_N_SIGMAS * sigma_ms, _MIN_DIFFERENCE_MS)
-    is_wrong = given_ms is not None and abs(found_ms - given_ms) > limit_ms
-    yield Finding(
-        name="rolling shutter",
-        value=found_ms,
-        unit="ms",
-        text=f"readout {found_ms:z.1f} ms, sigma {sigma_ms:.1f}",
-        threshold="" if given_ms is None else f"{given_ms:g} +/- {limit_ms:.1f} ms",
-        verdict="warning" if is_wrong else "info" if given_ms is None else "ok",
-        fix="--set camera.readout_ms=null learns it" if is_wrong else "",
-    )
+    return (mean_ms, sigma_ms) if sigma_ms <= _MAX_SIGMA_MS else None
 
 
 def _choose_parts(found: Survey, config: Config) -> list[tuple[int, int]]:
@@ -94,12 +115,10 @@ def _flow_px(sample: Sample, config: Config) -> float:
 
 def _learn(
     source: Source, parts: Sequence[tuple[int, int]], config: Config
-) -> list[tuple[float, float]]:
-    """Return what odometry learns of the readout time in each part, and its sigma, in ms."""
-    learning = {
-        "camera": config.camera.model_copy(update={"readout_ms": None}),
-    }
-    config = config.model_copy(update=learning)
+) -> list[Mapping[str, tuple[float, float]]]:
+    """Return the constants of the camera that odometry learns in each part, and their sigmas."""
+    unknown = config.camera.model_copy(update={"readout_ms": None})
+    config = config.model_copy(update={"camera": unknown})
     runs = [Odometry(source.info.camera, config) for _ in parts]
     for run in runs:
         run.link_gain = _LINK_GAIN
@@ -108,8 +127,8 @@ def _learn(
         part = _part_of(frame.stamp_ns, parts)
         if part is not None:
             runs[part].track(frame)
-    readouts = [run.rig_offsets.readout for run in runs if run.rig_offsets is not None]
-    return [(1e3 * value, 1e3 * sigma) for value, sigma in readouts]
+    offsets = [run.rig_offsets for run in runs]
+    return [each.learnt.constants for each in offsets if each is not None and each.learnt]
 
 
 def _part_of(stamp_ns: int, parts: Sequence[tuple[int, int]]) -> int | None:

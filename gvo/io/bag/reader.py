@@ -31,18 +31,26 @@ OLD_TF_TYPE = "tf/msg/tfMessage"
 """The type of `/tf` before tf2; it holds the same."""
 
 
-class BagMessage(FoundMessage):
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BagMessage:
     """A message, not decoded yet.
 
-    Attributes
+    Parameters
     ----------
-    topic : Channel
-        Name and type, and whether it is serialised the way of ROS 1, not CDR.
+    topic : Topic
+        As listed by the reader.
     log_time_ns : int
         When it was recorded, nanoseconds.
     data : bytes
         Serialised.
+    is_ros1 : bool
+        Serialised the way of ROS 1, not CDR.
     """
+
+    topic: Topic
+    log_time_ns: int
+    data: bytes
+    is_ros1: bool
 
     def decode(self) -> Any:  # noqa: ANN401 - classes made at run time
         """Return the message.
@@ -52,9 +60,8 @@ class BagMessage(FoundMessage):
         RecordingError
             When the data are not of the type.
         """
-        is_ros1 = self.topic.is_ros1
-        store = typestore(is_ros1=is_ros1)
-        decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
+        store = typestore(is_ros1=self.is_ros1)
+        decode = store.deserialize_ros1 if self.is_ros1 else store.deserialize_cdr
         try:
             return decode(memoryview(self.data), self.topic.type)
         except FAULTS as error:
@@ -141,14 +148,22 @@ class BagReader:
         What is damaged is left out, see `damage`; in a file without an index the order is that
         of its chunks. A file is opened when its first message is due.
         """
+        topics = {(topic.name, topic.type): topic for topic in self.topics}
         streams = [
             _begin(file, names)
             for file in files or self._files
             if any(channel.name in names for channel in file.counts)
         ]
         for _, message in merge(*streams, key=lambda item: item[0]):
-            if message is not None:
-                yield BagMessage(*message)
+            if message is None:
+                continue
+            channel = message.channel
+            yield BagMessage(
+                topic=topics[channel.name, channel.type],
+                log_time_ns=message.log_time_ns,
+                data=message.data,
+                is_ros1=channel.is_ros1,
+            )
 
     def _open_folder(self, folder: Path) -> list[BagFile]:
         found = find_files(folder)

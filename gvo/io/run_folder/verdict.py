@@ -164,6 +164,9 @@ def _looks_at_camera(offsets: Mapping[str, Any]) -> list[str]:
             f"the rectification, rows of the right image are off by up to {row:.2g} px: "
             "calibrate anew"
         )
+    if delay := offsets.get("delay_ms"):
+        when = "after" if delay > 0.0 else "before"
+        found.append(f"the trigger, right images are exposed {abs(delay):.2g} ms {when} left ones")
     sigma = offsets.get("readout_sigma_ms") or 0.0
     if sigma and abs(readout) > max(_READOUT_MS, 3.0 * sigma):
         found.append(f"a rolling shutter, rows are read out over {readout:.2g} ms")

@@ -1,3 +1,5 @@
 """An explained frame as pictures and a page."""
 
-from gvo.viz.explanation.write import write_explanation as write_explanation
+from gvo.viz.explanation.write import write_explanation
+
+__all__ = ["write_explanation"]

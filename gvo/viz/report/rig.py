@@ -37,7 +37,7 @@ def rig_plots(rig: object) -> list[Plot]:
     offsets = RigOffsets(camera, held)
     cells, arrows = (_places(camera, n) for n in (_N_CELLS, _N_ARROWS))
     disparity_px = (cells - offsets.take_off(cells))[:, 2]
-    moved = _without_turn(arrows - offsets.take_off(arrows), arrows, camera)
+    moved = offsets.pixel_errors(arrows)
     figure = _figure(camera, disparity_px, arrows, moved)
     sizes = {"disparity": np.abs(disparity_px).max(), "pixel": np.linalg.norm(moved, axis=1).max()}
     return [Plot(slug="rig", title=TITLES["rig"], figure=figure, facts=sizes)]
@@ -51,20 +51,6 @@ def _places(camera: StereoCamera, n: int) -> FloatArray:
         size * (np.arange(n) + 0.5), (np.arange(n_rows) + 0.5) * camera.height / n_rows
     )
     return np.column_stack([u.ravel(), v.ravel(), np.zeros(u.size)])
-
-
-def _without_turn(errors: FloatArray, places: FloatArray, camera: StereoCamera) -> FloatArray:
-    """Return errors of pixels (n, 2) less what a turn, focal length or principal point explains.
-
-    These hide in the poses, or are not observable; k1 alone would show the focal length it bends.
-    """
-    x, y = (places[:, 0] - camera.cx) / camera.fx, (places[:, 1] - camera.cy) / camera.fy
-    one, none = np.ones_like(x), np.zeros_like(x)
-    along = np.column_stack([one, none, x, -y, 1.0 + x * x, x * y])
-    across = np.column_stack([none, one, y, x, x * y, 1.0 + y * y])
-    fields, wanted = np.concatenate([along, across]), errors[:, :2].T.ravel()
-    left = wanted - fields @ np.linalg.lstsq(fields, wanted, rcond=None)[0]
-    return np.asarray(left.reshape(2, -1).T)
 
 
 def _figure(

@@ -103,7 +103,7 @@ def test_a_stream_a_frame_late_is_found_in_its_images(n_frames: int, word: str) 
     assert finding.verdict == "fault"
     assert f"a frame {word}" in finding.fix
     # Images that were not taken at once have no disparities to speak of.
-    others = {f"left/right: {name}" for name in ("row spread", "row field", "order")}
+    others = {f"left/right: {name}" for name in ("row spread", "row field", "order", "trigger")}
     assert complaints(result) <= {finding.name, "left/right: lens distortion"} | others
 
 

@@ -160,7 +160,11 @@ ANEW = ": calibrate anew"
                 f"the rectification, rows of the right image are off by up to 0.61 px{ANEW}",
             ],
         ),
-        ({"readout_ms": 3.0, "readout_sigma_ms": 0.1}, []),
+        (
+            {"delay_ms": -9.86},
+            ["the trigger, right images are exposed 9.9 ms before left ones"],
+        ),
+        ({"delay_ms": 0.0, "readout_ms": 3.0, "readout_sigma_ms": 0.1}, []),
         ({"readout_ms": 30.0, "readout_sigma_ms": 0.0}, []),  # as it was given
         (
             {"readout_ms": 20.9, "readout_sigma_ms": 1.3},

@@ -22,9 +22,9 @@ class Channel(NamedTuple):
 
 
 class FoundMessage(NamedTuple):
-    """A message, serialised."""
+    """A message of a file."""
 
-    topic: Channel
+    channel: Channel
     log_time_ns: int
     data: bytes
 
