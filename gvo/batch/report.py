@@ -125,19 +125,13 @@ def _box_plots(table: pd.DataFrame, rows: str) -> Plot:
     labels = [plain(cut(str(row), _MAX_NAME)) for row in shown]
     panels[0, 0].set_yticks(range(len(shown)), labels)
     panels[0, 0].invert_yaxis()
-    text = (
-        f"A row per {'configuration' if rows == 'variant' else 'recording'}, the most accurate "
-        "first. A box holds the middle half of the runs, its line is the median; points are runs. "
-    )
-    if _RELATIVE in names:
-        text += (
-            "The relative ATE is that over the median of all runs of the recording; runs with less "
-            "than 95 % of the poses of its best run are left out of it, as they cover the easy "
-            "part only. "
-        )
-    if len(order) > len(shown):
-        text += f"The first {len(shown)} of {len(order)} are drawn; the table holds all."
-    return Plot(slug="boxes", title=title, text=text.strip(), figure=figure)
+    facts = {
+        "rows": "configuration" if rows == "variant" else "recording",
+        "is_relative": _RELATIVE in names,
+        "n_drawn": len(shown),
+        "n": len(order),
+    }
+    return Plot(slug="boxes", title=title, facts=facts, figure=figure)
 
 
 def _draw_boxes(axes: Axes, values: Sequence[Any], *, colour: str) -> None:
@@ -152,15 +146,18 @@ def _draw_boxes(axes: Axes, values: Sequence[Any], *, colour: str) -> None:
 
 def _medians(table: pd.DataFrame) -> tuple[list[str], list[list[str]]]:
     """Return header and rows of the medians of each configuration, the most accurate first."""
-    rows = []
-    for name, runs in table.groupby("variant", sort=False):
-        error, frame_ms = runs[_RELATIVE].median(), runs[_TIME].median()
-        n_compared, n_failed = runs[_RELATIVE].count(), (runs["status"] == "failed").sum()
-        texts = [str(name), number_text(error, ".3f"), number_text(frame_ms, ".1f")]
-        rows.append((error, [*texts, str(n_compared), str(n_failed)]))
-    rows.sort(key=lambda row: (np.isnan(row[0]), row[0]))
+    runs = table.assign(is_failed=table["status"] == "failed").groupby("variant", sort=False)
+    found = runs.agg(
+        error=(_RELATIVE, "median"),
+        frame_ms=(_TIME, "median"),
+        n_compared=(_RELATIVE, "count"),
+        n_failed=("is_failed", "sum"),
+    ).sort_values("error", kind="stable")
     header = ["configuration", _RELATIVE, "frame [ms]", "compared runs", "failed runs"]
-    return header, [texts for _, texts in rows]
+    return header, [
+        [str(name), number_text(error, ".3f"), number_text(frame_ms, ".1f"), str(n), str(n_failed)]
+        for name, error, frame_ms, n, n_failed in found.itertuples()
+    ]
 
 
 def _known_columns(table: pd.DataFrame) -> dict[str, str]:
@@ -177,11 +174,8 @@ def _runs(table: pd.DataFrame, folder: Path) -> list[dict[str, Any]]:
         page = Path(row["folder"], REPORT)
         runs.append(
             {
-                "recording": row["recording"],
+                **row,
                 "link": quote(page.as_posix()) if (folder / page).exists() else "",
-                "variant": row["variant"],
-                "status": row["status"],
-                "reason": row["reason"],
                 "numbers": [
                     number_text(None if pd.isna(row[name]) else row[name], _COLUMNS[name][1])
                     for name in _known_columns(table)
