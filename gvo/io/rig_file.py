@@ -92,11 +92,9 @@ def with_rig(info: RecordingInfo, path: str | Path | None) -> RecordingInfo:
     """
     if path is None:
         return info
-    with named_faults(CalibrationError, path, others=(YamlError, UnicodeDecodeError)):
-        text = read_text(Path(path), max_bytes=MAX_CHARACTERS)
-        values = load_yaml(text)
-    with named_faults(CalibrationError, path, others=(CalibrationError,)):
-        camera = camera_of(values)
+    faults = YamlError, UnicodeDecodeError, CalibrationError
+    with named_faults(CalibrationError, path, others=faults):
+        camera = camera_of(load_yaml(read_text(Path(path), max_bytes=MAX_CHARACTERS)))
         theirs, ours = _camera_json(camera), _camera_json(info.camera)
         for name in ours:
             if not _is_same(theirs.get(name), ours[name]):

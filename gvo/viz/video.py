@@ -15,6 +15,7 @@ import numpy as np
 
 from gvo.errors import ConfigurationError, RecordingError, write_faults
 from gvo.io.images import encode_image
+from gvo.io.run_folder.line_file import PartFile
 from gvo.types import ImageArray
 
 CODECS: Final = {".webm": "VP80", ".mp4": "mp4v"}
@@ -49,8 +50,6 @@ def open_sink(path: Path) -> Film | PngFolder:
             f"{path}: expected a name ending in .webm (browsers) or .mp4 (players), or of a folder "
             f"for PNG files, got {path.name}"
         )
-    if path.exists():
-        raise RecordingError(f"{path}: exists already; give another path or remove it")
     with tempfile.TemporaryDirectory(prefix="gvo-film-") as folder:
         if _open_writer(Path(folder) / f"film{suffix}", _FALLBACK_HZ, (64, 64)) is None:
             raise ConfigurationError(
@@ -61,28 +60,18 @@ def open_sink(path: Path) -> Film | PngFolder:
 
 
 class Film:
-    """A film of pictures of one size, under another name in its folder until it is closed."""
+    """A film of pictures of one, even size, under another name until it is closed."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._waiting: list[ImageArray] = []
         self._stamps_ns: list[int] = []
         self._writer: cv2.VideoWriter | None = None
-        self._n, self._size = 0, (0, 0)
-        with write_faults(RecordingError, path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._folder = tempfile.TemporaryDirectory(dir=path.parent, prefix=".gvo-film-")
-        self._part = Path(self._folder.name) / f"film{path.suffix.lower()}"
+        self._n = 0
+        self._file = PartFile(path)
 
     def add(self, picture: ImageArray, stamp_ns: int) -> None:
-        """Encode one more picture, BGR, taken at a stamp; an odd last row or column is cut off."""
-        height, width = picture.shape[:2]
-        # Encoders subsample colours by two.
-        picture = np.ascontiguousarray(picture[: height & ~1, : width & ~1])
-        size = (picture.shape[1], picture.shape[0])
-        if self._n > 0 and size != self._size:
-            raise ValueError(f"expected a picture of {self._size}, got {size}")
-        self._size = size
+        """Encode one more picture, BGR, taken at a stamp."""
         self._n += 1
         if self._writer is not None:
             self._writer.write(picture)
@@ -94,22 +83,22 @@ class Film:
 
     def close(self) -> None:
         """Finish the film and give it its name; without pictures no file is left."""
-        with self._folder, write_faults(RecordingError, self.path):
+        with self._file.completed(is_kept=self._n > 0):
             if self._waiting:
                 self._begin()
             if self._writer is None:
                 return
             self._writer.release()
-            n_written = count_pictures(self._part)
+            n_written = count_pictures(self._file.part)
             if n_written != self._n:
                 raise RecordingError(
                     f"{self.path}: was not written whole: {n_written} of {self._n} frames; is its "
                     "disk full?"
                 )
-            self._part.rename(self.path)
 
     def _begin(self) -> None:
-        self._writer = _open_writer(self._part, rate_of(self._stamps_ns), self._size)
+        height, width = self._waiting[0].shape[:2]
+        self._writer = _open_writer(self._file.part, rate_of(self._stamps_ns), (width, height))
         if self._writer is None:
             raise RecordingError(f"{self.path}: OpenCV could not open it as a film")
         for picture in self._waiting:
@@ -161,7 +150,7 @@ def rate_of(stamps_ns: Sequence[int]) -> float:
 
 
 def _open_writer(path: Path, rate_hz: float, size: tuple[int, int]) -> cv2.VideoWriter | None:
-    fourcc = cv2.VideoWriter.fourcc(*CODECS[path.suffix])
+    fourcc = cv2.VideoWriter.fourcc(*CODECS[path.suffix.lower()])
     with _quiet_opencv(), _quiet_error_stream():
         writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, rate_hz, size)
     return writer if writer.isOpened() else None

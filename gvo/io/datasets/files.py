@@ -116,31 +116,21 @@ def read_stamped_rows(
 
     Stamps become nanoseconds without loss; a missing name is empty.
     """
-    rows = []
-    for number, (stamp, *fields) in read_rows(path, n_fields=n_fields, separator=separator):
+    rows: list[tuple[int, str]] = []
+    for number, line in text_lines(path, RecordingError, max_lines=_MAX_ROWS):
+        text = line.strip()
+        if not text or text.startswith("#"):
+            continue
+        stamp, *fields = (field.strip() for field in text.split(separator))
+        if len(fields) < n_fields - 1:
+            raise RecordingError(
+                f"{path}, line {number}: expected {n_fields} fields, got {len(fields) + 1}"
+            )
         try:
             rows.append((parse_stamp(stamp, unit_ns=unit_ns), fields[0] if fields else ""))
         except ValueError as error:
             reason = cut(str(error), _MAX_REASON)
             raise RecordingError(f"{path}, line {number}: {reason}") from None
-    return rows
-
-
-def read_rows(
-    path: Path, *, n_fields: int, separator: str | None = None
-) -> Iterator[tuple[int, list[str]]]:
-    """Yield line numbers, from one, and fields of a table, without comments and empty lines."""
-    is_empty = True
-    for number, line in text_lines(path, RecordingError, max_lines=_MAX_ROWS):
-        text = line.strip()
-        if not text or text.startswith("#"):
-            continue
-        is_empty = False
-        fields = [field.strip() for field in text.split(separator)]
-        if len(fields) < n_fields:
-            raise RecordingError(
-                f"{path}, line {number}: expected {n_fields} fields, got {len(fields)}"
-            )
-        yield number, fields
-    if is_empty:
+    if not rows:
         raise RecordingError(f"{path}: holds no rows")
+    return rows

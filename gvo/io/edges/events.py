@@ -53,10 +53,6 @@ class InputFaults:
         self._counts: dict[str, int] = {}
         self._first: dict[str, str] = {}
 
-    def __bool__(self) -> bool:
-        """Tell whether there was any."""
-        return bool(self._counts)
-
     def add(self, kind: str, first: str, *, n: int = 1) -> None:
         """Count a fault.
 
