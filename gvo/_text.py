@@ -7,7 +7,6 @@ million digits: `load_yaml` checks the size before any value is constructed.
 from __future__ import annotations
 
 import errno
-import html
 import math
 import re
 from collections.abc import Iterator, Sequence
@@ -80,11 +79,6 @@ def visible(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
-
-
-def html_text(text: str) -> str:
-    """Return a text for a page of HTML: `visible`, its markup escaped."""
-    return html.escape(visible(text))
 
 
 def plain_number(text: str) -> str:

@@ -1,5 +1,3 @@
 """The `gvo` command."""
 
-from gvo.cli.main import main
-
-__all__ = ["main"]
+from gvo.cli.main import main as main

@@ -13,6 +13,7 @@ from typing import Final, TypeVar
 from gvo.config import Config
 from gvo.errors import CalibrationError, RecordingError
 from gvo.io.bag.reader import BagMessage
+from gvo.io.bag.recovery.scan import Channel
 from gvo.io.bag.source import CAMERA_CHANGED, BagSource, ImageStamps
 from gvo.io.bag.topics import (
     CAMERA_INFO_TYPE,
@@ -127,12 +128,12 @@ class NetworkReader:
     def _subscribe(self, topic: Topic) -> None:
         is_image = topic.type in IMAGE_TYPES
         self._kept[topic.name] = deque(maxlen=1 if is_image else _N_KEPT)
-        take = partial(self._take, topic, is_image=is_image)
+        channel = Channel(topic.name, topic.type, self.transport.is_ros1)
+        take = partial(self._take, channel, is_image=is_image)
         self.transport.subscribe(topic.name, topic.type, take)
 
-    def _take(self, topic: Topic, data: bytes, stamp_ns: int, *, is_image: bool) -> None:
-        is_ros1 = self.transport.is_ros1
-        message = BagMessage(topic=topic, log_time_ns=stamp_ns, data=data, is_ros1=is_ros1)
+    def _take(self, topic: Channel, data: bytes, stamp_ns: int, *, is_image: bool) -> None:
+        message = BagMessage(topic, stamp_ns, data)
         kept = self._kept[topic.name]
         with self._changed:
             if not is_image:

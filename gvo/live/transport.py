@@ -16,6 +16,7 @@ from gvo._text import cut
 from gvo.config import Config, validate_configuration
 from gvo.errors import ConfigurationError
 from gvo.io.bag.reader import BagMessage, serialize, typestore
+from gvo.io.bag.recovery.scan import Channel
 from gvo.io.bag.topics import Topic
 from gvo.io.convert.bag_messages import MessageWriter
 
@@ -179,8 +180,7 @@ def decode(data: bytes, type_: str, *, is_ros1: bool) -> Any:  # noqa: ANN401 - 
     RecordingError
         If the bytes are not a message of the type.
     """
-    topic = Topic(name=type_, type=type_, n_messages=1)
-    return BagMessage(topic=topic, log_time_ns=0, data=data, is_ros1=is_ros1).decode()
+    return BagMessage(Channel(type_, type_, is_ros1), 0, data).decode()
 
 
 class Parameters:

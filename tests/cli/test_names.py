@@ -1,6 +1,7 @@
 """Names that a recording holds, made to order a terminal about: shown escaped, by all commands."""
 
 import dataclasses
+import html
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from gvo._text import html_text, visible
+from gvo._text import visible
 from gvo.io.bag.reader import BagReader, typestore
 from tests.conftest import Command, line_of_poses
 
@@ -89,7 +90,7 @@ def test_a_report_and_a_summary_name_the_recording_without_harm(
     for text in (answer.out + answer.err, *texts(tmp_path)):
         assert all(line.isprintable() for line in text.split("\n"))
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert html_text(EVIL) in page
+    assert html.escape(visible(EVIL)) in page
     assert "<b>&" not in page
     summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert summary["recording"] == FILE

@@ -26,9 +26,9 @@ from gvo.io.bag.reader import TF_TYPE, BagMessage, BagReader, find_files, serial
 from gvo.io.bag.recovery.inflate import DamageError
 from gvo.io.bag.recovery.mcap import McapScan
 from gvo.io.bag.recovery.ros1 import Ros1Scan
-from gvo.io.bag.recovery.scan import Scan
+from gvo.io.bag.recovery.scan import Channel, Scan
 from gvo.io.bag.source import BagSource
-from gvo.io.bag.topics import CAMERA_INFO_TYPE, COMPRESSED_TYPE, IMAGE_TYPE, Topic
+from gvo.io.bag.topics import CAMERA_INFO_TYPE, COMPRESSED_TYPE, IMAGE_TYPE
 from gvo.io.calibration.camera_info import make_calibration, make_rgbd_calibration
 from gvo.io.poses.tf import TfBuffer, read_tf
 from tests.fuzz.mutations import mutate_bytes, mutate_text
@@ -115,9 +115,8 @@ def _try(read: Callable[[], object]) -> None:
 def _message(data: bytes) -> None:
     """Decode a message; the first byte chooses its type, the second ROS 1 or 2."""
     number, is_ros1 = data.ljust(2, b"\0")[:2]
-    topic = Topic(name="/topic", type=_TYPES[number % len(_TYPES)], n_messages=1)
-    message = BagMessage(topic=topic, log_time_ns=0, data=data[2:], is_ros1=is_ros1 % 2 == 1)
-    content = message.decode()
+    topic = Channel("/topic", _TYPES[number % len(_TYPES)], is_ros1 % 2 == 1)
+    content = BagMessage(topic, 0, data[2:]).decode()
     if topic.type == TF_TYPE:
         buffer = TfBuffer()
         for transform in content.transforms:

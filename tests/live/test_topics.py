@@ -49,7 +49,7 @@ class Play:
     ) -> None:
         self.messages = [each for each in recorded(bag) if each.topic.name != "/tf"]
         self.said: list[str] = []
-        self.network = Network(is_ros1=self.messages[0].is_ros1)
+        self.network = Network(is_ros1=self.messages[0].topic.is_ros1)
         self.network.announce(BagReader(bag).topics)
         self.reader = NetworkReader(self.network)
         self._script = script or Play.send_all
@@ -229,12 +229,8 @@ def shifted(message: BagMessage, by_ns: int) -> BagMessage:
     if hasattr(content, "header"):
         stamp = content.header.stamp
         stamp.sec += by_ns // SECOND_NS
-    return BagMessage(
-        topic=message.topic,
-        log_time_ns=message.log_time_ns + by_ns,
-        data=serialize(content, message.topic.type, is_ros1=message.is_ros1),
-        is_ros1=message.is_ros1,
-    )
+    data = serialize(content, message.topic.type, is_ros1=message.topic.is_ros1)
+    return BagMessage(message.topic, message.log_time_ns + by_ns, data)
 
 
 def test_a_run_is_saved_moved_and_changed_while_it_goes_on(drive_bag: Path, tmp_path: Path) -> None:
@@ -388,7 +384,7 @@ def test_a_damaged_message_is_a_faulty_frame_at_its_stamp(
             n_images += message.topic.type in IMAGE_TYPES
             sent = data(message.data) if n_images == 11 else message.data
             late_ns = message.log_time_ns + 3600 * SECOND_NS  # the clock of the computer
-            play.network.send(replace(message, data=sent, log_time_ns=late_ns))
+            play.network.send(message._replace(data=sent, log_time_ns=late_ns))
 
     ((folder, result),) = Play(request.getfixturevalue(f"{name}_bag"), script).run(tmp_path / "out")
     assert result.summary["status_counts"]["skipped"] == 1
@@ -488,9 +484,10 @@ def test_images_that_nobody_takes_are_given_up_with_a_word(
     assert caplog.text.count("images are dropped") == 1
     n_dropped = 20 * 2 * N_FRAMES - 300
     assert f"{n_dropped} images were dropped before they were paired" in caplog.text
-    large, topic = bytes(60_000_000), next(t for t in play.reader.topics if t.type == IMAGE_TYPE)
+    first = next(each for each in play.messages if each.topic.type == IMAGE_TYPE)
+    large = BagMessage(first.topic, 0, bytes(60_000_000))
     for _ in range(20):
-        play.network.send(BagMessage(topic=topic, log_time_ns=0, data=large, is_ros1=False))
+        play.network.send(large)
     assert len([*play.reader.images()]) == 8  # of 512 MB
 
 
@@ -504,8 +501,8 @@ def test_a_camera_info_that_changes_is_told_once(
         for message in 3 * infos:
             content = message.decode()
             content.k = content.k + np.eye(3).ravel()
-            data = serialize(content, message.topic.type, is_ros1=message.is_ros1)
-            play.network.send(replace(message, data=data))
+            data = serialize(content, message.topic.type, is_ros1=message.topic.is_ros1)
+            play.network.send(message._replace(data=data))
 
     ((_, result),) = Play(drive_bag, script).run(tmp_path / "out")
     assert caplog.text.count("camera_info changes on the way: the first one is used") == 1

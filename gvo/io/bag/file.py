@@ -121,7 +121,7 @@ class BagFile:
         try:
             if self._scan is None:
                 for message in self._indexed(names):
-                    seen[message.channel].append(message.log_time_ns % 2**64)
+                    seen[message.topic].append(message.log_time_ns % 2**64)
                     yield message
                 self._check_number(sum(map(len, seen.values())), names)
                 return
@@ -141,12 +141,12 @@ class BagFile:
     ) -> Iterator[FoundMessage]:
         counts = {channel: Counter(log_times) for channel, log_times in seen.items()}
         for message in messages:
-            if message.channel not in self.counts:
+            if message.topic not in self.counts:
                 self._fault = f"{self.path}: messages of a damaged topic are left out"
                 continue
             log_time = message.log_time_ns % 2**64
-            if counts.get(message.channel, Counter())[log_time] > 0:
-                counts[message.channel][log_time] -= 1
+            if counts.get(message.topic, Counter())[log_time] > 0:
+                counts[message.topic][log_time] -= 1
             else:
                 yield message
 

@@ -55,7 +55,7 @@ def header_stamp(message: BagMessage) -> int | None:
     """Return the stamp at the start of a message that cannot be decoded; None if it is none."""
     if len(message.data) < _STAMP_END:
         return None
-    is_little = message.is_ros1 or message.data[1] & 1
+    is_little = message.topic.is_ros1 or message.data[1] & 1
     seconds, nanoseconds = struct.unpack_from("<iI" if is_little else ">iI", message.data, 4)
     return None if nanoseconds >= 10**9 else int(seconds * 10**9 + nanoseconds)
 

@@ -31,26 +31,18 @@ OLD_TF_TYPE = "tf/msg/tfMessage"
 """The type of `/tf` before tf2; it holds the same."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BagMessage:
+class BagMessage(FoundMessage):
     """A message, not decoded yet.
 
-    Parameters
+    Attributes
     ----------
-    topic : Topic
-        As listed by the reader.
+    topic : Channel
+        Name and type, and whether it is serialised the way of ROS 1, not CDR.
     log_time_ns : int
         When it was recorded, nanoseconds.
     data : bytes
         Serialised.
-    is_ros1 : bool
-        Serialised the way of ROS 1, not CDR.
     """
-
-    topic: Topic
-    log_time_ns: int
-    data: bytes
-    is_ros1: bool
 
     def decode(self) -> Any:  # noqa: ANN401 - classes made at run time
         """Return the message.
@@ -60,8 +52,9 @@ class BagMessage:
         RecordingError
             When the data are not of the type.
         """
-        store = typestore(is_ros1=self.is_ros1)
-        decode = store.deserialize_ros1 if self.is_ros1 else store.deserialize_cdr
+        is_ros1 = self.topic.is_ros1
+        store = typestore(is_ros1=is_ros1)
+        decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
         try:
             return decode(memoryview(self.data), self.topic.type)
         except FAULTS as error:
@@ -148,22 +141,14 @@ class BagReader:
         What is damaged is left out, see `damage`; in a file without an index the order is that
         of its chunks. A file is opened when its first message is due.
         """
-        topics = {(topic.name, topic.type): topic for topic in self.topics}
         streams = [
             _begin(file, names)
             for file in files or self._files
             if any(channel.name in names for channel in file.counts)
         ]
         for _, message in merge(*streams, key=lambda item: item[0]):
-            if message is None:
-                continue
-            channel = message.channel
-            yield BagMessage(
-                topic=topics[channel.name, channel.type],
-                log_time_ns=message.log_time_ns,
-                data=message.data,
-                is_ros1=channel.is_ros1,
-            )
+            if message is not None:
+                yield BagMessage(*message)
 
     def _open_folder(self, folder: Path) -> list[BagFile]:
         found = find_files(folder)

@@ -23,13 +23,8 @@ from gvo.io.bag.messages import (
     stamp_of,
 )
 from gvo.io.bag.reader import BagMessage, BagReader, MessageReader
-from gvo.io.bag.topics import (
-    COMPRESSED_TYPE,
-    CameraTopics,
-    Topic,
-    TopicChoice,
-    choose_topics,
-)
+from gvo.io.bag.recovery.scan import Channel
+from gvo.io.bag.topics import COMPRESSED_TYPE, CameraTopics, TopicChoice, choose_topics
 from gvo.io.calibration.files import CalibrationPaths, paths_of
 from gvo.io.images import MILLIMETRES
 from gvo.io.poses.tf import TfBuffer, read_tf
@@ -275,7 +270,7 @@ class BagSource:
             n_bytes=len(message.data),
         )
 
-    def _decoder(self, topic: Topic, stream: int) -> Callable[[Any], NDArray[Any]]:
+    def _decoder(self, topic: Channel, stream: int) -> Callable[[Any], NDArray[Any]]:
         is_compressed = topic.type == COMPRESSED_TYPE
         if stream == 1 and self._topics.sensor == "rgbd":
             decode_counts = decode_compressed_depth if is_compressed else decode_depth

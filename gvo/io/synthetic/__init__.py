@@ -1,23 +1,13 @@
 """Rendered recordings with exact ground truth."""
 
-from gvo.io.synthetic.recording import SyntheticRecording
-from gvo.io.synthetic.rendering import StillScene
-from gvo.io.synthetic.rig_error import RigError
-from gvo.io.synthetic.scene import Light, Rectangle, make_scene
-from gvo.io.synthetic.sensor import SensorNoise
-from gvo.io.synthetic.textures import Texture
-from gvo.io.synthetic.world import Scenery, World, WorldName
-
-__all__ = [
-    "Light",
-    "Rectangle",
-    "RigError",
-    "Scenery",
-    "SensorNoise",
-    "StillScene",
-    "SyntheticRecording",
-    "Texture",
-    "World",
-    "WorldName",
-    "make_scene",
-]
+from gvo.io.synthetic.recording import SyntheticRecording as SyntheticRecording
+from gvo.io.synthetic.rendering import StillScene as StillScene
+from gvo.io.synthetic.rig_error import RigError as RigError
+from gvo.io.synthetic.scene import Light as Light
+from gvo.io.synthetic.scene import Rectangle as Rectangle
+from gvo.io.synthetic.scene import make_scene as make_scene
+from gvo.io.synthetic.sensor import SensorNoise as SensorNoise
+from gvo.io.synthetic.textures import Texture as Texture
+from gvo.io.synthetic.world import Scenery as Scenery
+from gvo.io.synthetic.world import World as World
+from gvo.io.synthetic.world import WorldName as WorldName

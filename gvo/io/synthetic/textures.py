@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -239,3 +239,14 @@ def finish(canvas: Canvas, size_m: tuple[float, float], mask: BoolArray | None =
     smooth = np.asarray(cv2.GaussianBlur(padded, (0, 0), 0.6))[4:-4, 4:-4]
     pixels = np.clip(np.rint(smooth), 0, 255).astype(np.uint8)
     return Texture(pixels=pixels, size_m=size_m, mask=mask)
+
+
+def painted(
+    painters: Sequence[Callable[[np.random.Generator], Texture]], *seed: int
+) -> dict[str, Texture]:
+    """Return textures by the names of the functions that paint them, each of a seed of its own."""
+    named = {painter.__name__.removeprefix("_"): painter for painter in painters}
+    return {
+        name: painter(np.random.default_rng([*seed, number]))
+        for number, (name, painter) in enumerate(named.items())
+    }

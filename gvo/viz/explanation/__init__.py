@@ -1,5 +1,3 @@
 """An explained frame as pictures and a page."""
 
-from gvo.viz.explanation.write import write_explanation
-
-__all__ = ["write_explanation"]
+from gvo.viz.explanation.write import write_explanation as write_explanation

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -41,10 +40,10 @@ def write_page(path: Path, template: str, **values: Any) -> None:  # noqa: ANN40
         path.write_text(page, encoding="utf-8", newline="\n")
 
 
-def part(name: str, *values: Any) -> Markup:  # noqa: ANN401 - any text
-    """Return a part of a page by the name of its macro in `parts.html`."""
-    template = _environment().get_template("parts.html")
-    return Markup(getattr(template.module, name)(*values))  # noqa: S704 - escaped by the macro
+def part(name: str, *values: Any) -> str:  # noqa: ANN401 - any text
+    """Return a part of the page in the browser by the name of its macro in `panels.html`."""
+    template = _environment().get_template("panels.html")
+    return str(getattr(template.module, name)(*values))
 
 
 @cache
@@ -85,18 +84,3 @@ def _yaml(value: Any) -> str:  # noqa: ANN401
     if isinstance(value, bool):
         return str(value).lower()
     return f"{value:g}" if isinstance(value, float) and abs(value) < 1e5 else str(value)
-
-
-def changes(
-    configuration: Mapping[str, Any], defaults: Mapping[str, Mapping[str, Any]]
-) -> dict[str, list[tuple[str, Any, bool, Any]]]:
-    """Return each parameter by section: key, value, whether it was changed, default."""
-    sections = {}
-    for name, section in configuration.items():
-        if isinstance(section, Mapping):
-            known = defaults.get(name, {})
-            sections[name] = [
-                (key, value, known.get(key, value) != value, known.get(key))
-                for key, value in section.items()
-            ]
-    return sections

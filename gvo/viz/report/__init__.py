@@ -1,5 +1,4 @@
 """The report of a run, or of estimates compared with a reference, as one page."""
 
-from gvo.viz.report.run import write_comparison_report, write_run_report
-
-__all__ = ["write_comparison_report", "write_run_report"]
+from gvo.viz.report.run import write_comparison_report as write_comparison_report
+from gvo.viz.report.run import write_run_report as write_run_report

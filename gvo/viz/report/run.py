@@ -25,7 +25,7 @@ from gvo.trajectory.evaluation import (
 from gvo.trajectory.trajectory import Trajectory
 from gvo.viz.figures import Plot, elapsed, evenly, style, write_plots
 from gvo.viz.measures import truth_around
-from gvo.viz.pages import changes, write_page
+from gvo.viz.pages import write_page
 from gvo.viz.report.paths import (
     TITLES,
     Line,
@@ -225,17 +225,14 @@ def _words(record: RunRecord) -> dict[str, Any]:
     summary = record.summary
     return {
         "title": f"gvo: {record.name}",
-        "name": record.name,
+        "record": record,
+        "summary": summary,
         "verdict": verdict(summary) if "frames" in summary else "",
         "loop_words": loop_words(summary),
-        "is_finished": record.is_finished,
-        "warnings": [str(each) for each in summary.get("warnings", ())],
-        "facts": _facts(record),
-        "errors": summary.get("errors", ()),
-        "covariances": summary.get("covariances", ()),
+        "statuses": Counter(record.frames["status"]),
+        "duration": _duration(record),
         "loops": _loops(record.loops, _first_ns(record)),
-        "decisions": [str(each) for each in summary.get("decisions", ())],
-        "configuration": changes(summary.get("configuration", {}), Config().model_dump()),
+        "defaults": Config().model_dump(),
     }
 
 
@@ -259,45 +256,9 @@ def _loops(loops: Table, first_ns: int) -> dict[str, Any] | None:
     return {"header": _LOOP_COLUMNS, "rows": rows, "rest": rest}
 
 
-def _facts(record: RunRecord) -> dict[str, str]:
-    summary, frames = record.summary, record.frames
-    statuses = Counter(frames["status"])
-    coverage, memory = summary.get("coverage_percent"), summary.get("peak_memory_mb")
-    version = summary.get("gvo_version")
-    return {
-        "Sensor": str(summary.get("sensor", "")),
-        "Poses of": str(summary.get("base_frame", "")),
-        "Frames": str(len(frames["stamp_ns"])),
-        "Duration": _duration(record),
-        "Coverage": "" if coverage is None else f"{float(coverage):.1f} % of the frames tracked",
-        "Segments": _segment_words(summary.get("segments", ())),
-        "Status": ", ".join(f"{n} {status}" for status, n in statuses.items()),
-        "Ground truth": str(summary.get("ground_truth", "")),
-        "Median per frame": _median_words(summary.get("median_ms")),
-        "Peak memory": "" if memory is None else f"{float(memory):.0f} MB",
-        "Version": "" if version is None else f"gvo {version}",
-    }
-
-
-def _segment_words(segments: Sequence[Mapping[str, Any]]) -> str:
-    if len(segments) < 2:
-        return ""
-    joined = [
-        f"{segment['id']} joined to {segment['joined_to']}"
-        for segment in segments
-        if segment.get("joined_to") is not None
-    ]
-    return ", ".join([str(len(segments)), *joined])
-
-
 def _duration(record: RunRecord) -> str:
     stamps_ns = np.unique(record.frames["stamp_ns"])  # repeated ones are skipped
     if len(stamps_ns) < 2:
         return ""
     rate = 1e9 / float(np.median(np.diff(stamps_ns)))
     return f"{float(stamps_ns[-1] - stamps_ns[0]) / 1e9:.1f} s, {rate:.3g} frames per second"
-
-
-def _median_words(medians: Mapping[str, Any] | None) -> str:
-    known = {stage: ms for stage, ms in (medians or {}).items() if ms is not None}
-    return ", ".join(f"{stage} {float(ms):.1f} ms" for stage, ms in known.items())

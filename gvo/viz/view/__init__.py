@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from gvo.viz.view.page import Page
     from gvo.viz.view.player import Player
 
-__all__ = ["serve"]
-
 
 def serve(
     player: Player | LivePlayer,

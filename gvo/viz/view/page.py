@@ -18,12 +18,14 @@ from gvo.geometry import se3
 from gvo.trajectory.alignment import alignment, pair
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, ImageArray
+from gvo.viz.pages import part
+from gvo.viz.palette import DRAWN
 from gvo.viz.scene import GLOBAL, Path
-from gvo.viz.view import panels
 from gvo.viz.view.controls import ParameterControls
 from gvo.viz.view.drawing import LAYERS, Drawing
 from gvo.viz.view.live import LivePlayer
 from gvo.viz.view.newest import FrameView, Newest
+from gvo.viz.view.panels import frame_rows
 from gvo.viz.view.player import Player
 from gvo.viz.view.server import open_server, silence
 from gvo.viz.view.viewpoint import UP, ViewPoint
@@ -139,9 +141,9 @@ class Page(AbstractContextManager["Page"]):
         with tab:
             empty = np.full((90, 160, 3), 230, dtype=np.uint8)
             self._overlay = gui.add_image(empty, format="jpeg", jpeg_quality=80)
-            self.state = gui.add_html(panels.state_html("", ""))
-            self.numbers = gui.add_html(panels.numbers_html({"frame": "the first is coming"}))
-            gui.add_html(panels.legend_html(self._absent))
+            self.state = gui.add_html(part("state", "", "", DRAWN))
+            self.numbers = gui.add_html(part("numbers", {"frame": "the first is coming"}))
+            gui.add_html(part("legend", DRAWN, self._absent))
 
     def _add_main_panel(self) -> None:
         gui = self.server.gui
@@ -211,7 +213,7 @@ class Page(AbstractContextManager["Page"]):
     def _show_state(self) -> None:
         """Show what the player is doing, and what went wrong."""
         problems = [problem for problem in (self._refusal, self._player.fault) if problem]
-        content = panels.state_html(_state_of(self._player), "; ".join(problems))
+        content = part("state", _state_of(self._player), "; ".join(problems), DRAWN)
         if self.state.content != content:
             self.state.content = content
 
@@ -249,7 +251,7 @@ class Page(AbstractContextManager["Page"]):
         if self._placed_for != newest.first_index:
             self._placed_for = newest.first_index
             self._place(frame)
-        self.numbers.content = panels.numbers_html(panels.frame_rows(frame, self._player.n_frames))
+        self.numbers.content = part("numbers", frame_rows(frame, self._player.n_frames))
         self._overlay.image = _rgb(frame.overlay)
         self.drawing.show_camera(frame.T_world_frame, _rgb(frame.image))
         self.drawing.show_points(frame.cloud)

@@ -22,9 +22,9 @@ class Channel(NamedTuple):
 
 
 class FoundMessage(NamedTuple):
-    """A message of a file."""
+    """A message, serialised."""
 
-    channel: Channel
+    topic: Channel
     log_time_ns: int
     data: bytes
 

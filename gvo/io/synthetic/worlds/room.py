@@ -41,7 +41,7 @@ def room_rectangles() -> list[Rectangle]:
         *_chair(np.array([0.55, 0.85]), 0.35),
         *_cartons(np.array([1.6, 0.55])),
         *_coffee_table(np.array([-0.55, 0.75]), 0.2),
-        *_plant(np.array([1.72, 1.66])),
+        *_potted_plant(np.array([1.72, 1.66])),
     ]
 
 
@@ -78,7 +78,7 @@ def _picture(
 def _north_side() -> Iterator[Rectangle]:
     """Yield the bookcase, the window with its curtains, and pictures on three walls."""
     yield from fronted(box(_at(-1.15, 1.82), _NORTH, (0.34, 1.2, 1.95), plain("wood")), "books")
-    yield from _carton(_at(-1.4, 1.8), 0.1, 0.32, 1.95)
+    yield from _one_carton(_at(-1.4, 1.8), 0.1, 0.32, 1.95)
     window = replace(stretched("window"), is_lit=False, gain=1.05)
     yield wall(_at(0.0, 1.99), _at(1.3, 1.99), (1.05, 2.15), window)
     for x in (-0.2, 1.28):
@@ -151,16 +151,18 @@ def _chair(center: FloatArray, angle: float) -> Iterator[Rectangle]:
         yield from box(post, angle, (0.035, 0.035, 0.56), plain("wood"), bottom=0.46)
 
 
-def _carton(center: FloatArray, angle: float, size: float, bottom: float) -> Iterator[Rectangle]:
+def _one_carton(
+    center: FloatArray, angle: float, size: float, bottom: float
+) -> Iterator[Rectangle]:
     sizes = (size, 1.15 * size, 0.8 * size)
     yield from box(center, angle, sizes, stretched("carton"), bottom=bottom)
 
 
 def _cartons(center: FloatArray) -> Iterator[Rectangle]:
     """Yield a pile of cartons."""
-    yield from _carton(center, 0.2, 0.55, 0.0)
-    yield from _carton(center + _at(0.03, 0.02), -0.3, 0.42, 0.44)
-    yield from _carton(center + _at(-0.1, -0.65), 0.6, 0.45, 0.0)
+    yield from _one_carton(center, 0.2, 0.55, 0.0)
+    yield from _one_carton(center + _at(0.03, 0.02), -0.3, 0.42, 0.44)
+    yield from _one_carton(center + _at(-0.1, -0.65), 0.6, 0.45, 0.0)
 
 
 def _coffee_table(center: FloatArray, angle: float) -> Iterator[Rectangle]:
@@ -174,7 +176,7 @@ def _coffee_table(center: FloatArray, angle: float) -> Iterator[Rectangle]:
     yield from box(center + _at(0.25, 0.05), 0.7, size, stretched("chart"), bottom=0.4)
 
 
-def _plant(center: FloatArray) -> Iterator[Rectangle]:
+def _potted_plant(center: FloatArray) -> Iterator[Rectangle]:
     """Yield a plant in a pot, its leaves on crossing cards."""
     yield from box(center, 0.4, (0.28, 0.28, 0.3), plain("cushion"))
     for k in range(3):
@@ -182,34 +184,6 @@ def _plant(center: FloatArray) -> Iterator[Rectangle]:
         ends = center - 0.25 * across, center + 0.25 * across
         leaves = replace(stretched("plant"), is_two_sided=True, is_lit=False, gain=0.85 + 0.1 * k)
         yield wall(*ends, (0.2, 1.1), leaves)
-
-
-def room_textures(seed: int) -> dict[str, Texture]:
-    """Paint the textures of the room; the same seed gives the same bytes."""
-    painters = {
-        "planks": _planks,
-        "carpet": _carpet,
-        "wallpaper": _wallpaper,
-        "plaster": _plaster,
-        "wood": _wood,
-        "books": _books,
-        "landscape": _landscape,
-        "abstract": _abstract,
-        "chart": _chart,
-        "window": _window,
-        "curtain": _curtain,
-        "fabric": _fabric,
-        "cushion": _cushion,
-        "carton": _carton_texture,
-        "screen": _screen,
-        "keyboard": _keyboard,
-        "page": _page,
-        "plant": _plant_texture,
-    }
-    return {
-        name: painter(np.random.default_rng([seed, 3, k]))
-        for k, (name, painter) in enumerate(painters.items())
-    }
 
 
 def _grain(rng: np.random.Generator) -> Canvas:
@@ -394,7 +368,7 @@ def _cushion(rng: np.random.Generator) -> Texture:
     return paint.finish(canvas, (0.45, 0.45))
 
 
-def _carton_texture(rng: np.random.Generator) -> Texture:
+def _carton(rng: np.random.Generator) -> Texture:
     canvas = 138 + 6 * paint.noise(rng, exponent=1.0) + 4 * paint.noise(rng, exponent=0.2)
     paint.fill(canvas, (0.44, 0, 0.12, 1), 172)
     paint.fill(canvas, (0.06, 0.52, 0.32, 0.36), 225)
@@ -442,7 +416,7 @@ def _page(rng: np.random.Generator) -> Texture:
     return paint.finish(canvas, (0.21, 0.3))
 
 
-def _plant_texture(rng: np.random.Generator) -> Texture:
+def _plant(rng: np.random.Generator) -> Texture:
     """Paint long leaves that hang over, stretched over a card."""
     canvas = 100 + 24 * paint.noise(rng, exponent=0.8)
     shape = paint.blank(0)
@@ -455,3 +429,15 @@ def _plant_texture(rng: np.random.Generator) -> Texture:
         paint.polyline(canvas, path, float(rng.uniform(60, 160)), 18)
         paint.polyline(canvas, path, float(rng.uniform(150, 200)), 3)
     return paint.finish(canvas, (0.8, 0.8), mask=paint.opaque(shape))
+
+
+# In the order of their seeds.
+_PAINTERS = (
+    *(_planks, _carpet, _wallpaper, _plaster, _wood, _books, _landscape, _abstract, _chart),
+    *(_window, _curtain, _fabric, _cushion, _carton, _screen, _keyboard, _page, _plant),
+)
+
+
+def room_textures(seed: int) -> dict[str, Texture]:
+    """Paint the textures of the room; the same seed gives the same bytes."""
+    return paint.painted(_PAINTERS, seed, 3)

@@ -20,39 +20,6 @@ HOUSES = ("brick", "plaster", "stone", "panel")
 SHOPS = ("shop", "doors")
 
 
-def street_textures(seed: int) -> dict[str, Texture]:
-    """Paint the textures of the street; the same seed gives the same bytes."""
-    painters = {
-        "asphalt": _asphalt,
-        "pavement": _pavement,
-        "kerb": _kerb,
-        "grass": _grass,
-        "brick": brick_house,
-        "plaster": plaster_house,
-        "stone": stone_house,
-        "panel": panel_house,
-        "shop": shop,
-        "doors": doors,
-        "wall": _garden_wall,
-        "tiles": _roof_tiles,
-        "leaves": _leaves,
-        "bark": _bark,
-        "metal": _metal,
-        "paint": _white_paint,
-        "car": _car_side,
-        "body": _car_body,
-        "front": _car_front,
-        "glass": _car_glass,
-        "gable": gable,
-        "sign": _sign,
-        "sky": _sky,
-    }
-    return {
-        name: painter(np.random.default_rng([seed, 1, k]))
-        for k, (name, painter) in enumerate(painters.items())
-    }
-
-
 def _asphalt(rng: np.random.Generator) -> Texture:
     canvas = 104 + 7 * paint.noise(rng, exponent=1.0) + 9 * paint.noise(rng, exponent=0.2)
     for _ in range(9):  # patches of repairs
@@ -88,12 +55,12 @@ def _grass(rng: np.random.Generator) -> Texture:
     return paint.finish(canvas, (6.0, 6.0))
 
 
-def _garden_wall(rng: np.random.Generator) -> Texture:
+def _wall(rng: np.random.Generator) -> Texture:
     canvas = 122 + 18 * paint.bricks(rng, 16, 32, joint=3) + 9 * paint.noise(rng, exponent=1.0)
     return paint.finish(canvas, (4.0, 2.4))
 
 
-def _roof_tiles(rng: np.random.Generator) -> Texture:
+def _tiles(rng: np.random.Generator) -> Texture:
     canvas = 88 + 10 * paint.bricks(rng, 24, 24, joint=5) + 8 * paint.noise(rng, exponent=1.0)
     return paint.finish(canvas, (6.0, 6.0))
 
@@ -121,7 +88,7 @@ def _metal(rng: np.random.Generator) -> Texture:
     return paint.finish(canvas, (2.0, 2.0))
 
 
-def _white_paint(rng: np.random.Generator) -> Texture:
+def _paint(rng: np.random.Generator) -> Texture:
     worn = np.minimum(0, paint.noise(rng, exponent=0.9) + 0.9)
     canvas = 205 + 5 * paint.noise(rng, exponent=0.4) + 40 * worn
     return paint.finish(canvas, (4.0, 4.0))
@@ -131,7 +98,7 @@ def _car_points(points: Sequence[tuple[float, float]]) -> list[tuple[float, floa
     return [(x / CAR_LENGTH_M, 1.0 - y / CAR_HEIGHT_M) for x, y in points]
 
 
-def _car_side(rng: np.random.Generator) -> Texture:
+def _car(rng: np.random.Generator) -> Texture:
     """Paint a car from its right side, stretched over length and height."""
     shape = paint.blank(0)
     paint.polygon(shape, _car_points([(0.0, 0.22), *CAR_PROFILE, (4.4, 0.22)]), 1)
@@ -157,13 +124,13 @@ def _car_side(rng: np.random.Generator) -> Texture:
     return paint.finish(canvas, (CAR_LENGTH_M, CAR_HEIGHT_M), mask=paint.opaque(shape))
 
 
-def _car_body(rng: np.random.Generator) -> Texture:
+def _body(rng: np.random.Generator) -> Texture:
     canvas = 165 + 6 * paint.noise(rng, exponent=1.6)
     paint.frame(canvas, (0.03, 0.03, 0.94, 0.94), 90, 0.012)
     return paint.finish(canvas, (2.0, 2.0))
 
 
-def _car_front(rng: np.random.Generator) -> Texture:
+def _front(rng: np.random.Generator) -> Texture:
     """Paint lamps, grille and number plate, stretched over a bumper."""
     canvas = paint.gradient(170, 100) + 2 * paint.noise(rng, exponent=1.5)
     for x in (0.05, 0.77):
@@ -176,7 +143,7 @@ def _car_front(rng: np.random.Generator) -> Texture:
     return paint.finish(canvas, (2.0, 1.0))
 
 
-def _car_glass(rng: np.random.Generator) -> Texture:
+def _glass(rng: np.random.Generator) -> Texture:
     canvas = paint.gradient(110, 40) + 8 * paint.noise(rng, exponent=1.5)
     paint.polygon(canvas, [(0.15, 1), (0.35, 0), (0.55, 0), (0.35, 1)], 135)
     for x in (0.22, 0.62):  # the seats behind it
@@ -244,7 +211,7 @@ def _house(
     return paint.finish(canvas, (12.0, 3 * STOREY_M))
 
 
-def brick_house(rng: np.random.Generator) -> Texture:
+def _brick(rng: np.random.Generator) -> Texture:
     """Paint bricks and white windows."""
     canvas = 104 + 13 * paint.bricks(rng, 48, 120) + 7 * paint.noise(rng, exponent=1.2)
     for row in range(3):
@@ -253,7 +220,7 @@ def brick_house(rng: np.random.Generator) -> Texture:
     return _house(canvas, rng, (0.42, 0.56), 225)
 
 
-def plaster_house(rng: np.random.Generator) -> Texture:
+def _plaster(rng: np.random.Generator) -> Texture:
     """Paint plaster with shutters and stains."""
     canvas = 186 + 5 * paint.noise(rng, exponent=1.4) + 5 * paint.noise(rng, exponent=0.3)
     for row in range(3):
@@ -271,7 +238,7 @@ def plaster_house(rng: np.random.Generator) -> Texture:
     return _house(canvas, rng, (0.36, 0.58), 235)
 
 
-def stone_house(rng: np.random.Generator) -> Texture:
+def _stone(rng: np.random.Generator) -> Texture:
     """Paint ashlar with framed windows."""
     canvas = 152 + 9 * paint.bricks(rng, 16, 24, joint=3) + 7 * paint.noise(rng, exponent=0.9)
     for row in range(3):
@@ -283,7 +250,7 @@ def stone_house(rng: np.random.Generator) -> Texture:
     return _house(canvas, rng, (0.46, 0.6), 70)
 
 
-def panel_house(rng: np.random.Generator) -> Texture:
+def _panel(rng: np.random.Generator) -> Texture:
     """Paint concrete panels with wide windows."""
     canvas = 128 + 12 * paint.bricks(rng, 8, 6, joint=4, shift=0.0)
     canvas += 5 * paint.noise(rng, exponent=0.6)
@@ -302,7 +269,7 @@ def _ground_floor(rng: np.random.Generator, grey: float) -> Canvas:
     return canvas
 
 
-def shop(rng: np.random.Generator) -> Texture:
+def _shop(rng: np.random.Generator) -> Texture:
     """Paint three shops, a ground floor."""
     canvas = _ground_floor(rng, 120)
     for k, name in enumerate(("BAKERY", "BOOKS & MAPS", "CAMERA")):
@@ -332,7 +299,7 @@ def _door(canvas: Canvas, box: Box, grey: float) -> None:
     paint.disc(canvas, (x + 0.9 * w, y + 0.55 * h), (0.003, 0.012), 220)
 
 
-def doors(rng: np.random.Generator) -> Texture:
+def _doors(rng: np.random.Generator) -> Texture:
     """Paint doors and windows, a ground floor."""
     canvas = _ground_floor(rng, 140)
     for k in range(4):
@@ -342,10 +309,25 @@ def doors(rng: np.random.Generator) -> Texture:
     return paint.finish(canvas, (12.0, STOREY_M))
 
 
-def gable(rng: np.random.Generator) -> Texture:
+def _gable(rng: np.random.Generator) -> Texture:
     """Paint a triangle of bricks, stretched over the end of a roof."""
     canvas = 112 + 13 * paint.bricks(rng, 40, 56) + 7 * paint.noise(rng, exponent=1.2)
     _window(canvas, rng, (0.44, 0.5, 0.12, 0.26), 225)
     shape = paint.blank(0)
     paint.polygon(shape, [(0, 1), (0.5, 0), (1, 1)], 1)
     return paint.finish(canvas, (10.0, 4.5), mask=paint.opaque(shape))
+
+
+# In the order of their seeds.
+_PAINTERS = (
+    *(_asphalt, _pavement, _kerb, _grass),
+    *(_brick, _plaster, _stone, _panel, _shop, _doors),
+    *(_wall, _tiles, _leaves, _bark, _metal, _paint),
+    *(_car, _body, _front, _glass),
+    *(_gable, _sign, _sky),
+)
+
+
+def street_textures(seed: int) -> dict[str, Texture]:
+    """Paint the textures of the street; the same seed gives the same bytes."""
+    return paint.painted(_PAINTERS, seed, 1)

@@ -58,7 +58,7 @@ _FOREIGN = -1
 def _read(bag: BagFile | Scan, written: Sequence[Message] = _MESSAGES) -> list[int]:
     """Return which of the messages come, by number."""
     numbers = {message: n for n, message in enumerate(written)}
-    found = [(m.channel.name, m.log_time_ns, m.data) for m in bag.messages(TOPICS)]
+    found = [(m.topic.name, m.log_time_ns, m.data) for m in bag.messages(TOPICS)]
     return [numbers.get(message, _FOREIGN) for message in found]
 
 
@@ -231,7 +231,7 @@ def test_messages_that_the_index_gave_are_not_given_again(tmp_path: Path) -> Non
 def test_mcap_holds_messages_of_ros1_too(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(open_mcap(_MESSAGES, "lz4", encoding="ros1"))
-    assert all(message.channel.is_ros1 for message in BagFile(path).messages(TOPICS))
+    assert all(message.topic.is_ros1 for message in BagFile(path).messages(TOPICS))
 
 
 def test_a_log_that_is_not_part_of_a_database_is_told(bags: dict[str, Path]) -> None:
