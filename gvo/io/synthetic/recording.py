@@ -9,7 +9,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from gvo.geometry.camera import Calibration, PinholeCamera
+from gvo.geometry.camera import Calibration
 from gvo.geometry.se3 import invert, make_transform
 from gvo.io.recording import RecordingInfo, Sensor, StampedImage, shown
 from gvo.io.synthetic.rendering import scale_camera, to_uint8
@@ -145,19 +145,18 @@ class SyntheticRecording:
             Metres along the optical axis at the centre of each pixel, of a rolling shutter from
             the pose of its row.
         """
-        T_map_cam, camera = self._view(index, stream)
-        return self._scene.depth(self._elapsed_s(index), T_map_cam, camera)
+        return self._scene.depth(self._elapsed_s(index), self._view(index, stream), self._camera)
 
     def _elapsed_s(self, index: int) -> float:
         return 1e-9 * float(self._elapsed_ns[index])
 
-    def _view(self, index: int, stream: int) -> tuple[FloatArray, PinholeCamera]:
-        """Return pose or poses and camera of a stream; the depth camera is the colour camera."""
+    def _view(self, index: int, stream: int) -> FloatArray:
+        """Return the pose or poses of a stream's camera; that of depth is the colour camera."""
         T_map_cam = self._poses(index)
         if stream == 0 or self._sensor == "rgbd":
-            return T_map_cam, self._camera
+            return T_map_cam
         T_left_right = make_transform(np.eye(3), np.array([self._world.baseline_m, 0.0, 0.0]))
-        return T_map_cam @ T_left_right, self._camera
+        return T_map_cam @ T_left_right
 
     def _poses(self, index: int) -> FloatArray:
         """Return the pose of a frame, shape (4, 4), or those of its rows, (height, 4, 4)."""
@@ -173,9 +172,8 @@ class SyntheticRecording:
         if stream == 1 and self._sensor == "rgbd":
             depth = self.render_depth(index)
             return spoil_depth(depth if bent is None else bent.bend_depth(depth), self._noise, rng)
-        T_map_cam, camera = self._view(index, stream)
         elapsed_s = self._elapsed_s(index)
-        grey = self._scene.image(elapsed_s, T_map_cam, camera)
+        grey = self._scene.image(elapsed_s, self._view(index, stream), self._camera)
         if bent is not None:
             grey = bent.bend(grey, self.render_depth(index, 1) if stream == 1 else None)
         return to_uint8(expose(grey, self._noise, rng, stream=stream, elapsed_s=elapsed_s))

@@ -85,17 +85,13 @@ def block_rectangles(seed: int) -> list[Rectangle]:
     return rectangles
 
 
-def _point(s: float, right: float) -> FloatArray:
-    return road_point(s, right)
-
-
 def _angle(s: float) -> float:
     return float(heading(s))
 
 
 def _backdrop() -> Iterator[Rectangle]:
     """Yield meadows to the horizon, and four screens of sky around them."""
-    center = 0.5 * (_point(0.0, 0.0) + _point(0.5 * LAP_M, 0.0))
+    center = 0.5 * (road_point(0.0, 0.0) + road_point(0.5 * LAP_M, 0.0))
     end = np.array([0.0, _SKY_M])
     yield slab(center - end, center + end, 2 * _SKY_M, -0.05, plain("grass"))
     sky = replace(plain("sky"), is_lit=False)
@@ -119,7 +115,7 @@ def _road() -> Iterator[Rectangle]:
     for k, (s, e) in enumerate(_segments()):
         lift = 0.002 * (k % 2)  # neighbours overlap in bends
         middle = 0.5 * (left + right)
-        start, end = _point(s - 0.6, middle), _point(e + 0.6, middle)
+        start, end = road_point(s - 0.6, middle), road_point(e + 0.6, middle)
         surface = replace(plain("asphalt"), offset_m=(0.0, -e % 8.0))
         yield slab(start, end, right - left + 1.0, lift, surface)
         yield from _pavement(s, e, left, _KERB_M + lift)
@@ -131,11 +127,11 @@ def _pavement(s: float, e: float, kerb: float, height: float) -> Iterator[Rectan
     sign = float(np.sign(kerb))
     walk = kerb + 2.5 * sign
     tile = replace(plain("pavement"), offset_m=(0.0, -e % 4.0))
-    yield slab(_point(s - 0.5, walk), _point(e + 0.5, walk), 5.0, height, tile)
-    ends = _point(s, kerb), _point(e, kerb)
+    yield slab(road_point(s - 0.5, walk), road_point(e + 0.5, walk), 5.0, height, tile)
+    ends = road_point(s, kerb), road_point(e, kerb)
     yield wall(*(ends if sign < 0 else ends[::-1]), (0.0, height), plain("kerb"))
     stone = kerb + 0.1 * sign
-    yield slab(_point(s, stone), _point(e, stone), 0.22, height + 0.004, plain("kerb"))
+    yield slab(road_point(s, stone), road_point(e, stone), 0.22, height + 0.004, plain("kerb"))
 
 
 def _markings() -> Iterator[Rectangle]:
@@ -143,16 +139,16 @@ def _markings() -> Iterator[Rectangle]:
     height, white = 0.006, replace(plain("paint"), is_lit=False)
     for s in np.arange(0.0, LAP_M, 8.0):
         dash = replace(white, offset_m=(float(s) % 3.7, float(s) % 2.9))
-        yield slab(_point(s, -1.7), _point(s + 3.5, -1.7), 0.14, height, dash)
+        yield slab(road_point(s, -1.7), road_point(s + 3.5, -1.7), 0.14, height, dash)
     for s in np.arange(0.0, LAP_M, 4.0):
         for right in (2.0, -5.0):
             line = replace(white, offset_m=(float(s) % 3.1, right), gain=0.9)
-            yield slab(_point(s, right), _point(s + 2.6, right), 0.1, height, line)
+            yield slab(road_point(s, right), road_point(s + 2.6, right), 0.1, height, line)
     for s in (44.0, 118.0, 146.0, 244.0, 318.0):
         for k in range(10):
             right = _KERBS[0] + 1.1 + 1.1 * k
             bar = replace(white, offset_m=(0.7 * k, 0.3 * k))
-            yield slab(_point(s, right), _point(s + 3.0, right), 0.55, height + 0.003, bar)
+            yield slab(road_point(s, right), road_point(s + 3.0, right), 0.55, height + 0.003, bar)
 
 
 def _houses(
@@ -182,7 +178,7 @@ def _house(
     depth = 10.0
     angle = _angle(s) - 0.5 * np.pi * np.sign(set_back)  # of who enters
     inwards, _ = ground_axes(angle)
-    center = _point(s, set_back) + 0.5 * depth * inwards
+    center = road_point(s, set_back) + 0.5 * depth * inwards
     eaves = STOREY_M * int(rng.integers(2, 5))
     tone = float(rng.uniform(0.82, 1.12))
     offset = (3.0 * int(rng.integers(0, 4)), STOREY_M * int(rng.integers(0, 3)))
@@ -224,7 +220,7 @@ def _garden(rng: np.random.Generator, s: float, set_back: float, gap: float) -> 
     """Yield the wall that closes a gap between houses, and a tree behind it."""
     angle = _angle(s) - 0.5 * np.pi * np.sign(set_back)
     inwards, _ = ground_axes(angle)
-    center = _point(s, set_back)
+    center = road_point(s, set_back)
     yield from box(center, angle, (0.3, gap + 6.0, 2.0), plain("wall"), top=plain("kerb"))
     yield from _tree(rng, center + 4.0 * inwards, 7.5)
 
@@ -250,7 +246,7 @@ def _trees_and_posts(
     sign = 1.0 if side else -1.0
     s = ends[0] + float(rng.uniform(4.0, 10.0))
     while s < ends[1]:
-        foot = _point(s, _KERBS[side] + sign * float(rng.uniform(0.5, 0.8)))
+        foot = road_point(s, _KERBS[side] + sign * float(rng.uniform(0.5, 0.8)))
         if rng.random() < 0.55:
             yield from _tree(rng, foot, float(rng.uniform(5.0, 7.0)))
         else:
@@ -275,7 +271,7 @@ def _parked_cars(
     while s < LAP_M - 6.0:
         # Whoever parks on the left came the other way.
         angle = _angle(s) + (0.0 if side else np.pi)
-        place = _point(s, _PARKING[side] + float(rng.normal(0.0, 0.1)))
+        place = road_point(s, _PARKING[side] + float(rng.normal(0.0, 0.1)))
         tone = float(rng.choice([0.45, 0.7, 0.95, 1.25]))
         if not free[0] < s < free[1]:
             yield from _car(place, angle, tone)
