@@ -25,15 +25,7 @@ from gvo.frontend.stereo.matching import (
 from gvo.frontend.tracking import WINDOW_RADIUS_PX, detect_corners, halve
 from gvo.geometry.camera import StereoCamera
 from gvo.kernels.stereo import RADIUS_PX
-from gvo.types import (
-    BoolArray,
-    FloatArray,
-    Frame,
-    ImageArray,
-    IntArray,
-    RgbdFrame,
-    StereoFrame,
-)
+from gvo.types import BoolArray, FloatArray, Frame, ImageArray, IntArray, RgbdFrame, StereoFrame
 
 # Columns of the correlation on either side of the partner, for RGB-D.
 _REACH_PX = 20

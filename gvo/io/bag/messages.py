@@ -24,12 +24,7 @@ from gvo.io.bag.image_encodings import (
     stored_pixels,
 )
 from gvo.io.calibration.camera_info import CameraFields, RegionOfInterest
-from gvo.io.images import (
-    decode_image,
-    depth_from_counts,
-    depth_from_metres,
-    to_8_bit,
-)
+from gvo.io.images import decode_image, depth_from_counts, depth_from_metres, to_8_bit
 from gvo.io.png import is_png
 from gvo.trajectory.formats import MAX_POSITION_M
 from gvo.types import DepthArray, Failure, FloatArray, ImageArray

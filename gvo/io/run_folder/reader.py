@@ -16,13 +16,7 @@ from numpy.typing import NDArray
 from gvo._text import read_text, text_lines
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
-from gvo.io.run_folder.writer import (
-    GLOBAL,
-    POSITIONS_HEADER,
-    TRAJECTORIES,
-    TRUE_POSITIONS,
-    TRUTH,
-)
+from gvo.io.run_folder.writer import GLOBAL, POSITIONS_HEADER, TRAJECTORIES, TRUE_POSITIONS, TRUTH
 from gvo.trajectory.evaluation import SMOOTHED_GLOBAL
 from gvo.trajectory.formats import MAX_LINES, MAX_POSITION_M, read_covariances, read_trajectory
 from gvo.trajectory.trajectory import StampsFrom, Trajectory

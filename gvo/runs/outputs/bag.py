@@ -68,25 +68,9 @@ from gvo.io.run_folder.line_file import PartFile
 from gvo.runs.outputs import bag_messages as messages
 from gvo.runs.outputs.file import FileOutput
 from gvo.runs.outputs.frames import ODOM, RunFrames, twist_between
-from gvo.types import (
-    Estimate,
-    FaultyFrame,
-    FloatArray,
-    Frame,
-    FrameResult,
-    Optimum,
-    Status,
-)
+from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Optimum, Status
 from gvo.viz.overlay import draw_matches
-from gvo.viz.scene import (
-    GLOBAL,
-    History,
-    Scene,
-    StampedPose,
-    grey_values,
-    placed_matches,
-    scene,
-)
+from gvo.viz.scene import GLOBAL, History, Scene, StampedPose, grey_values, placed_matches, scene
 from gvo.viz.scene import Path as PosePath
 
 SUFFIXES: Final = (".mcap", ".bag")

@@ -9,12 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from gvo.diagnostics.explain.values import (
-    FrameExplanation,
-    Link,
-    Registration,
-    Sorting,
-)
+from gvo.diagnostics.explain.values import FrameExplanation, Link, Registration, Sorting
 from gvo.frontend.klt import image_of
 from gvo.geometry.refinement import GATE
 from gvo.types import FloatArray, RelativePose, RgbdFrame, StereoFrame

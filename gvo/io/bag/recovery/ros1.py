@@ -12,15 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from gvo.io.bag.recovery.inflate import MAX_INFLATED, DamageError
-from gvo.io.bag.recovery.scan import (
-    Channel,
-    Losses,
-    Record,
-    Scan,
-    Window,
-    share,
-    standard_type,
-)
+from gvo.io.bag.recovery.scan import Channel, Losses, Record, Scan, Window, share, standard_type
 
 _MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = range(2, 8)
 _MAX_HEADER = 1 << 16
