@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -531,3 +532,58 @@ def _step(kind: Kind, size: float) -> float:
     if kind == "integer" or size <= 0.0:
         return 1.0
     return 10.0 ** (math.floor(math.log10(size)) - 2)
+
+
+class Parameters:
+    """The configuration of a run that goes on, which any thread may change.
+
+    `list_parameters` has the names, ranges and meanings.
+
+    Parameters
+    ----------
+    config : Config
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._followers: list[Callable[[Config], None]] = []
+        self._lock = threading.Lock()
+
+    @property
+    def config(self) -> Config:
+        """The configuration of the next frame."""
+        return self._config
+
+    def follow(self, callback: Callable[[Config], None]) -> None:
+        """Call `callback` after each change, in the thread that made it."""
+        self._followers.append(callback)
+
+    def set(self, values: Mapping[str, object]) -> Config:
+        """Change parameters.
+
+        Parameters
+        ----------
+        values : mapping of str to object
+            By `section.key`.
+
+        Returns
+        -------
+        Config
+            With the changes.
+
+        Raises
+        ------
+        ConfigurationError
+            If one does not exist or is out of range; then none is changed.
+        """
+        with self._lock:
+            nested = self._config.model_dump()
+            for name, value in values.items():
+                section, _, key = name.partition(".")
+                if key not in nested.get(section, ()):
+                    raise ConfigurationError(f"there is no parameter {cut(name, 60)}")
+                nested[section][key] = value
+            self._config = config = validate_configuration(nested)
+        for callback in self._followers:
+            callback(config)
+        return config

@@ -22,10 +22,11 @@ from typing import Any, Final, Literal, TypeAlias
 from rosbags.interfaces import Nodetype
 
 from gvo._text import cut
+from gvo.config import Parameters
 from gvo.errors import ConfigurationError, GvoError, missing_extra
 from gvo.io.bag.reader import typestore
 from gvo.io.bag.topics import IMAGE_TYPES, Topic
-from gvo.live.transport import OnMessage, Parameters, Service, decode
+from gvo.live.transport import OnMessage, Service, decode
 
 try:
     from cyclonedds import builtin, core, domain, pub, sub, topic, util

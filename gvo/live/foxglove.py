@@ -10,10 +10,10 @@ import threading
 from collections.abc import Sequence
 from typing import Any
 
-from gvo.config import Config, values_by_name
+from gvo.config import Config, Parameters, values_by_name
 from gvo.errors import ConfigurationError, missing_extra
 from gvo.io.bag.reader import typestore
-from gvo.live.transport import Parameters, Publisher, Service
+from gvo.live.transport import Publisher, Service
 
 try:
     import foxglove

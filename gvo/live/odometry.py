@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import numpy as np
 
 from gvo._text import cut
-from gvo.config import Config
+from gvo.config import Config, Parameters
 from gvo.errors import GvoError, OutputError, RecordingError
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.io.bag.messages import transform_of
@@ -25,7 +25,7 @@ from gvo.io.recording import ChosenImages, Source, StampedImage
 from gvo.io.run_folder.writer import free_path
 from gvo.io.sync import MAX_WAITING_BYTES, Pair, Paired
 from gvo.live.publishing import Arrivals, LiveMessages
-from gvo.live.transport import SET_POSE, TRIGGER, NetworkWriter, Parameters, Service, Sink
+from gvo.live.transport import SET_POSE, TRIGGER, NetworkWriter, Service, Sink
 from gvo.odometry.odometry import Odometry
 from gvo.runs.loop import RunLoop
 from gvo.runs.outputs.bag import TOPICS

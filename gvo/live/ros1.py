@@ -29,11 +29,11 @@ from urllib.parse import urlsplit
 
 from rosbags.typesys.msg import denormalize_msgtype, normalize_msgtype
 
-from gvo.config import Config, Parameter, list_parameters
+from gvo.config import Config, Parameter, Parameters, list_parameters
 from gvo.errors import ConfigurationError, GvoError, RecordingError
 from gvo.io.bag.reader import serialize, typestore
 from gvo.io.bag.topics import Topic
-from gvo.live.transport import OnMessage, Parameters, Service, ServiceType
+from gvo.live.transport import OnMessage, Service, ServiceType
 
 _LOGGER = logging.getLogger(__name__)
 # Where Debian and Ubuntu install rospy. Appended to the path, so that it shadows no package.

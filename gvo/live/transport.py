@@ -5,16 +5,13 @@ Messages are bytes: rosbags serialises them, so that no message packages of ROS 
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Protocol, TypeAlias
 
 from rosbags.typesys import get_types_from_msg
 
-from gvo._text import cut
-from gvo.config import Config, validate_configuration
-from gvo.errors import ConfigurationError
+from gvo.config import Parameters
 from gvo.io.bag.reader import BagMessage, serialize, typestore
 from gvo.io.bag.recovery.scan import Channel
 from gvo.io.bag.topics import Topic
@@ -181,61 +178,6 @@ def decode(data: bytes, type_: str, *, is_ros1: bool) -> Any:  # noqa: ANN401 - 
         If the bytes are not a message of the type.
     """
     return BagMessage(Channel(type_, type_, is_ros1), 0, data).decode()
-
-
-class Parameters:
-    """The configuration of a running camera, which any thread may change.
-
-    `gvo.config.list_parameters` has the names, ranges and meanings.
-
-    Parameters
-    ----------
-    config : Config
-    """
-
-    def __init__(self, config: Config) -> None:
-        self._config = config
-        self._followers: list[Callable[[Config], None]] = []
-        self._lock = threading.Lock()
-
-    @property
-    def config(self) -> Config:
-        """The configuration of the next frame."""
-        return self._config
-
-    def follow(self, callback: Callable[[Config], None]) -> None:
-        """Call `callback` after each change, in the thread that made it."""
-        self._followers.append(callback)
-
-    def set(self, values: Mapping[str, object]) -> Config:
-        """Change parameters.
-
-        Parameters
-        ----------
-        values : mapping of str to object
-            By `section.key`.
-
-        Returns
-        -------
-        Config
-            With the changes.
-
-        Raises
-        ------
-        ConfigurationError
-            If one does not exist or is out of range; then none is changed.
-        """
-        with self._lock:
-            nested = self._config.model_dump()
-            for name, value in values.items():
-                section, _, key = name.partition(".")
-                if key not in nested.get(section, ()):
-                    raise ConfigurationError(f"there is no parameter {cut(name, 60)}")
-                nested[section][key] = value
-            self._config = config = validate_configuration(nested)
-        for callback in self._followers:
-            callback(config)
-        return config
 
 
 class NetworkWriter(MessageWriter):

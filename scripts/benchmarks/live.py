@@ -27,11 +27,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import gvo
+from gvo.config import Parameters
 from gvo.io.frames import one_opencv_thread, paired
 from gvo.io.recording import Source, StampedImage
 from gvo.io.sync import Pair
 from gvo.live.odometry import LiveOdometry
-from gvo.live.transport import Parameters, Service
+from gvo.live.transport import Service
 from gvo.runs.summary import peak_memory_mb
 from gvo.types import FaultyFrame, FloatArray, Progress
 

@@ -8,9 +8,10 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from gvo.config import Parameters
 from gvo.io.bag.reader import BagMessage, BagReader
 from gvo.io.bag.topics import Topic
-from gvo.live.transport import Parameters, Service, decode
+from gvo.live.transport import Service, decode
 
 
 class Outlet:

@@ -15,10 +15,10 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import gvo
-from gvo.config import Config
+from gvo.config import Config, Parameters
 from gvo.errors import ConfigurationError
 from gvo.live.foxglove import Foxglove
-from gvo.live.transport import SET_POSE, TRIGGER, NetworkWriter, Parameters, Service, decode
+from gvo.live.transport import SET_POSE, TRIGGER, NetworkWriter, Service, decode
 from gvo.runs.outputs.bag import RunMessages
 from gvo.runs.outputs.frames import RunFrames
 from gvo.types import FrameResult, StereoFrame

@@ -14,7 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import gvo
-from gvo.config import Config
+from gvo.config import Config, Parameters
 from gvo.errors import ConfigurationError, RecordingError
 from gvo.geometry import se3
 from gvo.io.bag.messages import stamp_of, transform_of
@@ -24,7 +24,7 @@ from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import ChosenImages, StampedImage
 from gvo.live.odometry import LiveOdometry, LiveRun, Stretches
 from gvo.live.topics import NetworkReader, TopicSource, wait_for
-from gvo.live.transport import Parameters, decode
+from gvo.live.transport import decode
 from gvo.odometry.graph import RunGraph
 from gvo.runs.outputs.bag import TOPICS
 from gvo.trajectory.formats import read_trajectory

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
-from typing import Protocol
+from collections.abc import Callable
 
 from gvo.backend.window import SlidingWindow
-from gvo.config import Config, values_by_name
+from gvo.config import Config, Parameters, values_by_name
 from gvo.io.recording import Source
 from gvo.types import FaultyFrame, Frame, FrameResult
 from gvo.viz.view.newest import Newest
@@ -16,20 +15,6 @@ from gvo.viz.view.newest import Newest
 # rests no longer than would look dead.
 _SHARE, _LEAST_SHARE = 0.5, 0.02
 _LONGEST_REST_S = 3.0
-
-
-class Adjustable(Protocol):
-    """Parameters of a run, which others change too."""
-
-    @property
-    def config(self) -> Config:
-        """The present configuration."""
-
-    def set(self, values: Mapping[str, object]) -> Config:
-        """Change parameters by `section.key`, or raise `ConfigurationError`."""
-
-    def follow(self, callback: Callable[[Config], None]) -> None:
-        """Call back after each change."""
 
 
 class LivePlayer:
@@ -42,7 +27,7 @@ class LivePlayer:
     ----------
     source : Source
         The camera.
-    parameters : Adjustable
+    parameters : Parameters
 
     Attributes
     ----------
@@ -59,7 +44,7 @@ class LivePlayer:
     fault = ""
     is_busy = is_finished = False
 
-    def __init__(self, source: Source, parameters: Adjustable) -> None:
+    def __init__(self, source: Source, parameters: Parameters) -> None:
         self.source, self.parameters = source, parameters
         self.newest = Newest(source.info.camera)
         self.is_watched: Callable[[], bool] = lambda: True

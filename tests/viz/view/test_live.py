@@ -8,10 +8,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from gvo.config import Config
+from gvo.config import Config, Parameters
 from gvo.io.synthetic import SyntheticRecording
 from gvo.live.odometry import LiveOdometry
-from gvo.live.transport import Parameters
 from gvo.runs.outputs.options import RunOutputs
 from gvo.types import FaultyFrame
 from gvo.viz.view import serve
