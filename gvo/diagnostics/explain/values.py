@@ -9,6 +9,7 @@ import numpy as np
 
 from gvo.config import Config
 from gvo.frontend.klt import image_of
+from gvo.frontend.offsets import RigOffsets
 from gvo.geometry.camera import StereoCamera
 from gvo.types import (
     BoolArray,
@@ -166,10 +167,8 @@ class FrameExplanation:
     reference_index : int or None
     result : FrameResult
         As of `gvo run`, to the last bit.
-    offset_px, row_offset_px : float
-        Learnt of the rig before: subtracted from disparities, added to rows of the right image.
-    readout_ms : float
-        Time from the first to the last row that was assumed.
+    offsets : RigOffsets
+        What was learnt of the rig before.
     measured : Sorting
         Keypoints with their disparities, or depths of an RGB-D frame.
     corner : Corner or None
@@ -187,9 +186,7 @@ class FrameExplanation:
     reference: Frame | None
     reference_index: int | None
     result: FrameResult
-    offset_px: float
-    row_offset_px: float
-    readout_ms: float
+    offsets: RigOffsets
     measured: Sorting
     corner: Corner | None
     registration: Registration | None

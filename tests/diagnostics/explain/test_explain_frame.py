@@ -131,9 +131,9 @@ def test_the_offsets_of_the_rig_are_those_that_the_frame_was_measured_with() -> 
     # What the last frame taught takes effect with the next one.
     offsets, explanation = odometry.rig_offsets, explained("klt", "stereo")
     assert offsets is not None
-    assert explanation.offset_px == offsets.lens[0]
-    assert explanation.row_offset_px == offsets.rows[0] != 0.0
-    assert explanation.readout_ms == 1e3 * offsets.readout_s
+    assert explanation.offsets.lens[0] == offsets.lens[0]
+    assert explanation.offsets.rows[0] == offsets.rows[0] != 0.0
+    assert explanation.offsets.readout_s == offsets.readout_s
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -141,7 +141,7 @@ def test_it_is_told_how_far_rows_are_moved_for_the_readout_assumed(kind: str) ->
     moved_px = []
     for readout_ms in (12.0, 24.0):
         explanation = explained(kind, "rgbd", LAST, f"camera.readout_ms={readout_ms}")
-        assert explanation.readout_ms == readout_ms
+        assert 1e3 * explanation.offsets.readout_s == readout_ms
         assert explanation.registration is not None
         moved_px.append(explanation.registration.row_motion_px)
     assert 0.3 < moved_px[0] < 20.0
