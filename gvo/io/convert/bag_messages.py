@@ -74,7 +74,12 @@ class MessageWriter(ABC):
         self._store = typestore(is_ros1=is_ros1)
 
     def make(self, type_: str, **fields: Any) -> Any:  # noqa: ANN401 - made at run time
-        """Return a message of a type `package/msg/Name`, with all its fields by name."""
+        """Return a message of a type `package/msg/Name`; fields that are not given are empty."""
+        definitions: Any = self._store.fielddefs[type_][1]
+        for name, (kind, what) in definitions:
+            if name not in fields:
+                is_message = kind == interfaces.Nodetype.NAME
+                fields[name] = self.make(what) if is_message else _nothing(kind, what)
         return self._store.types[type_](**fields)
 
     def header(self, header: Header) -> Any:  # noqa: ANN401 - made at run time
@@ -87,8 +92,7 @@ class MessageWriter(ABC):
                 f"0 to {max_seconds} s"
             )
         stamp = self.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
-        sequence = {"seq": 0} if self.is_ros1 else {}
-        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=header.frame_id, **sequence)
+        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=header.frame_id)
 
     def serialize(self, message: object, type_: str) -> bytes:
         """Return the bytes of a message, as ROS 1 has them or as CDR."""
@@ -116,6 +120,14 @@ class MessageWriter(ABC):
             Of the topic, told with its first message: the last message is kept for those who
             subscribe later.
         """
+
+
+def _nothing(kind: interfaces.Nodetype, what: Any) -> Any:  # noqa: ANN401 - as rosbags defines fields
+    """Return an empty text, zero, or a sequence of nothing."""
+    if kind == interfaces.Nodetype.BASE:
+        return {"string": "", "bool": False}.get(what[0], 0)
+    of, element = what[0]
+    return np.zeros(0, element[0]) if of == interfaces.Nodetype.BASE else []
 
 
 class BagWriter(MessageWriter):
@@ -205,7 +217,6 @@ def write_image(writer: MessageWriter, topic: str, pixels: NDArray[Any], header:
         height=height,
         width=width,
         encoding=encoding,
-        is_bigendian=0,
         step=data.nbytes // height,
         data=data.view(np.uint8).ravel(),
     )
@@ -263,16 +274,12 @@ def write_camera_info(
 ) -> None:
     """Write a calibration as `CameraInfo`, all numbers without loss."""
     matrices = {name: getattr(calibration, name).ravel() for name in "DKRP"}
-    region = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
     message = writer.make(
         CAMERA_INFO_TYPE,
         header=writer.header(header),
         height=calibration.height,
         width=calibration.width,
         distortion_model=calibration.model,
-        binning_x=0,
-        binning_y=0,
-        roi=writer.make("sensor_msgs/msg/RegionOfInterest", do_rectify=False, **region),
         **{name if writer.is_ros1 else name.lower(): M for name, M in matrices.items()},
     )
     writer.write(topic, CAMERA_INFO_TYPE, message, header.stamp_ns)

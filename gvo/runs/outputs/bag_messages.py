@@ -8,7 +8,6 @@ from typing import Any, Final
 import numpy as np
 
 from gvo.geometry import se3
-from gvo.io.bag.topics import COMPRESSED_TYPE
 from gvo.io.convert.bag_messages import Header, MessageWriter, pose_numbers
 from gvo.runs.outputs.frames import Twist
 from gvo.types import Estimate, FloatArray, ImageArray, IntArray, Status
@@ -21,7 +20,7 @@ CLOUD_TYPE: Final = "sensor_msgs/msg/PointCloud2"
 MARKER_TYPE: Final = "visualization_msgs/msg/Marker"
 DIAGNOSTICS_TYPE: Final = "diagnostic_msgs/msg/DiagnosticArray"
 
-_LINE_LIST, _ADD = 5, 0  # of visualization_msgs/Marker
+_LINE_LIST = 5  # of visualization_msgs/Marker
 _LINE_WIDTH_M = 0.03
 
 # Three bytes of padding: four-byte fields that start at multiples of four are read anywhere.
@@ -91,35 +90,15 @@ def write_lines(
         ns=name,
         id=number,
         type=_LINE_LIST,
-        action=_ADD,
         pose=_pose(writer, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]),
-        scale=writer.make("geometry_msgs/msg/Vector3", x=_LINE_WIDTH_M, y=0.0, z=0.0),
+        scale=writer.make("geometry_msgs/msg/Vector3", x=_LINE_WIDTH_M),
         color=writer.make("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=1.0),
-        lifetime=writer.make("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
-        frame_locked=False,
         points=[
             writer.make("geometry_msgs/msg/Point", x=x, y=y, z=z)
             for x, y, z in segments.reshape(-1, 3).tolist()
         ],
-        colors=[],
-        text="",
-        mesh_resource="",
-        mesh_use_embedded_materials=False,
-        **({} if writer.is_ros1 else _untextured(writer)),
     )
     writer.write("/gvo/loops", MARKER_TYPE, message, header.stamp_ns)
-
-
-def _untextured(writer: MessageWriter) -> dict[str, object]:
-    """Return what the markers of ROS 2 hold besides."""
-    nothing = np.zeros(0, dtype=np.uint8)
-    header = writer.header(Header(0, ""))
-    return {
-        "texture_resource": "",
-        "texture": writer.make(COMPRESSED_TYPE, header=header, format="", data=nothing),
-        "uv_coordinates": [],
-        "mesh_file": writer.make("visualization_msgs/msg/MeshFile", filename="", data=nothing),
-    }
 
 
 def write_points(
@@ -136,7 +115,6 @@ def write_points(
         height=1,
         width=len(cloud),
         fields=_point_fields(writer),
-        is_bigendian=False,
         point_step=_POINT.itemsize,
         row_step=cloud.nbytes,
         data=cloud.view(np.uint8).reshape(-1),
