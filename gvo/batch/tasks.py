@@ -28,6 +28,8 @@ from gvo.types import Progress
 # A value of a parameter, as YAML gives it.
 Value: TypeAlias = float | int | bool | str | None
 RunStatus: TypeAlias = Literal["complete", "partly", "failed"]
+# Of a summary, as they are there.
+_TAKEN_OVER = ("sensor", "frames", "tracked", "coverage_percent", "gvo_version")
 _STAGES = ("extract", "register", "links", "window")
 MARK = "batch.json"
 # How long to wait for another process that writes the folder of the run.
@@ -115,10 +117,7 @@ def _measures_of(summary: Mapping[str, Any]) -> dict[str, Any]:
     smoothed = errors.get("smoothed", {})
     medians = summary["median_ms"]
     return {
-        "sensor": summary["sensor"],
-        "frames": summary["frames"],
-        "tracked": summary["tracked"],
-        "coverage_percent": summary["coverage_percent"],
+        **{name: summary[name] for name in _TAKEN_OVER},
         "segments": len(summary["segments"]),
         **{f"ate_{name}_m": each["ate_m"] for name, each in errors.items()},
         "rpe_smoothed_m": smoothed.get("rpe_m"),
@@ -126,7 +125,6 @@ def _measures_of(summary: Mapping[str, Any]) -> dict[str, Any]:
         "t_smoothed_percent": smoothed.get("t_pct"),
         "r_smoothed_deg_per_100m": smoothed.get("r_deg_per_100m"),
         "frame_ms": sum(medians[stage] for stage in _STAGES),
-        "gvo_version": summary["gvo_version"],
     }
 
 

@@ -221,15 +221,13 @@ def decode_compressed_depth(
 
 def camera_fields(message: Any, where: str) -> CameraFields:  # noqa: ANN401 - ROS 1 or 2
     """Return the fields of a `CameraInfo` of ROS 1 (`K`) or ROS 2 (`k`), not checked."""
+    matrices: dict[str, Any] = {name: _matrix(message, name) for name in "KDRP"}
     return CameraFields(
         where=where,
         width=int(message.width),
         height=int(message.height),
         model=str(message.distortion_model),
-        K=_matrix(message, "K"),
-        D=_matrix(message, "D"),
-        R=_matrix(message, "R"),
-        P=_matrix(message, "P"),
+        **matrices,
         binning=(int(message.binning_x), int(message.binning_y)),
         roi=RegionOfInterest(
             **{name: int(getattr(message.roi, name)) for name in RegionOfInterest.__slots__}

@@ -14,7 +14,7 @@ from gvo.geometry import se3
 from gvo.geometry.geodesy import local_enu
 from gvo.io.bag.messages import bare, stamp_of, transform_of
 from gvo.io.bag.reader import BagReader, MessageReader
-from gvo.io.bag.topics import Topic, describe_topics, find_topic
+from gvo.io.bag.topics import Topic, asked_topic, describe_topics
 from gvo.io.edges.events import InputFaults
 from gvo.io.edges.pose_streams import PoseStream
 from gvo.trajectory.trajectory import Trajectory
@@ -75,7 +75,7 @@ def find_topics(
     """Find the topics that were asked for; without names the only one there is."""
     found = [topic for topic in reader.topics if topic.type in types and topic.n_messages]
     if names:
-        return [_find(name, found, where) for name in names]
+        return [asked_topic(name, found, where, "pose") for name in names]
     if len(found) == 1:
         return found
     if not found:
@@ -84,14 +84,6 @@ def find_topics(
         f"{where}: holds more than one topic of poses; choose by --topic NAME, repeated to fuse "
         f"several: {describe_topics(found)}"
     )
-
-
-def _find(name: str, topics: Sequence[Topic], where: str) -> Topic:
-    topic = find_topic(name, topics)
-    if topic is None:
-        held = describe_topics(topics) or "none"
-        raise RecordingError(f"{where}: has no poses on topic {name}; topics of poses: {held}")
-    return topic
 
 
 class PoseMessage(NamedTuple):

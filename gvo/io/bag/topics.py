@@ -127,7 +127,7 @@ def choose_topics(topics: Sequence[Topic], choice: TopicChoice, where: str) -> C
         held = describe_topics(topics) or "no messages"
         raise RecordingError(f"{where}: holds no image topics; it holds {held}")
     sensor, names = _wanted(choice, where)
-    chosen = [None if name is None else _find(name, images, where) for name in names]
+    chosen = [None if name is None else asked_topic(name, images, where, "image") for name in names]
     first, second = chosen
     if sensor is not None and first is not None and second is not None:
         return CameraTopics(sensor=sensor, first=first, second=second)
@@ -179,6 +179,15 @@ def find_topic(name: str, topics: Iterable[Topic]) -> Topic | None:
     return next((topic for topic in topics if topic.name.strip("/") == name.strip("/")), None)
 
 
+def asked_topic(name: str, topics: Sequence[Topic], where: str, kind: str) -> Topic:
+    """Return the topic of a name that the user gave; refuse one that is not of its kind."""
+    topic = find_topic(name, topics)
+    if topic is None:
+        held = describe_topics(topics) or "none"
+        raise RecordingError(f"{where}: has no {kind} topic {name}; it has {held}")
+    return topic
+
+
 def describe_topics(topics: Sequence[Topic]) -> str:
     """Return the first topics with types and numbers of messages in one line; empty for none."""
     items = [f"{topic.name} ({topic.type}, {topic.n_messages})" for topic in topics[:_N_LISTED]]
@@ -195,14 +204,6 @@ def _wanted(choice: TopicChoice, where: str) -> tuple[Sensor | None, _Names]:
     if any(stereo):
         return "stereo", stereo
     return ("rgbd", rgbd) if any(rgbd) else (None, (None, None))
-
-
-def _find(name: str, images: Sequence[Topic], where: str) -> Topic:
-    topic = find_topic(name, images)
-    if topic is None:
-        held = describe_topics(images)
-        raise RecordingError(f"{where}: has no image topic {name}; it has {held}")
-    return topic
 
 
 def _fitting(pairs: Iterable[CameraTopics], chosen: list[Topic | None]) -> Iterator[CameraTopics]:
