@@ -14,6 +14,7 @@ def test_the_demo_its_comparison_and_its_smoothing(
 ) -> None:
     out = tmp_path / "gvo-demo"
     monkeypatch.setattr("gvo.runs.demo.N_FRAMES", 4)
+    monkeypatch.setattr("os.cpu_count", lambda: 1)  # each process that renders makes the world
     assert command("demo", "--out", out).code == 0
     check_place(out, force=True)  # it may be made anew
     assert command("demo", "--out", out).code == 2

@@ -371,7 +371,7 @@ class WindowMachine(RuleBasedStateMachine):
 
 
 @pytest.mark.parametrize(
-    ("n_examples", "n_steps"), [(25, 60), pytest.param(10, 400, marks=pytest.mark.acceptance)]
+    ("n_examples", "n_steps"), [(25, 60), pytest.param(5, 400, marks=pytest.mark.acceptance)]
 )
 def test_any_mixture_of_calls_leaves_a_window_that_goes_on(n_examples: int, n_steps: int) -> None:
     run_state_machine_as_test(

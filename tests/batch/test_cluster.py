@@ -42,7 +42,7 @@ def test_a_worker_that_is_killed_in_the_middle_costs_nothing(
 
 @pytest.mark.acceptance
 def test_a_scheduler_that_is_lost_is_a_line_and_the_batch_goes_on_with_another(
-    tmp_path: Path, long_bag: Path, bags: Path, cluster: Cluster, command: Command
+    tmp_path: Path, long_bag: Path, bags: Path, near: Client, command: Command
 ) -> None:
     folder = tmp_path / "other"
     folder.mkdir()
@@ -62,7 +62,8 @@ def test_a_scheduler_that_is_lost_is_a_line_and_the_batch_goes_on_with_another(
     assert said.splitlines()[-1].startswith("gvo: error: ")
     assert "the scheduler is gone" in said.splitlines()[-1]
     assert "Traceback" not in said
-    options = ["--out", out, "--scheduler", cluster.address, "--no-report"]
+    address = near.scheduler_info(n_workers=0)["address"]
+    options = ["--out", out, "--scheduler", address, "--no-report"]
     answer = command("batch", *asked, *options)
     assert answer.code == 0, answer.err
     assert answer.err.count("complete, found") == 1
