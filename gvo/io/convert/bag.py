@@ -14,7 +14,7 @@ from gvo.errors import RecordingError
 from gvo.geometry.camera import Calibration
 from gvo.io.convert import bag_messages
 from gvo.io.convert.bag_messages import BagWriter, FramePose, Header
-from gvo.io.convert.plan import BODY_FRAME, Form, Plan, plan_images, pose_of_right, pose_on_body
+from gvo.io.convert.plan import BODY_FRAME, Form, plan_images, pose_of_right, pose_on_body
 from gvo.io.images import MILLIMETRES, exact_counts
 from gvo.io.poses.truth import TRUTH_FRAMES
 from gvo.io.recording import RecordingInfo, Source, StampedImage
@@ -57,15 +57,15 @@ class BagForm(Form):
     those of the rectified cameras, also beside raw images.
     """
 
-    def __init__(self, path: Path, plan: Plan) -> None:
-        super().__init__(path, plan)
-        self._streams = plan_streams(plan.source, rectify=plan.rectify)
-        plan.names = tuple(f"{stream.topic} images" for stream in self._streams)
-        is_depth_compressed = plan.info.sensor == "stereo" or _is_in_millimetres(plan.source)
-        self._is_compressed = (plan.compress, plan.compress and is_depth_compressed)
+    def __init__(self, path: Path, source: Source, **options: Any) -> None:  # noqa: ANN401
+        super().__init__(path, source, **options)
+        self._streams = plan_streams(self.source, rectify=self.rectify)
+        self.names = tuple(f"{stream.topic} images" for stream in self._streams)
+        is_depth_compressed = self.info.sensor == "stereo" or _is_in_millimetres(self.source)
+        self._is_compressed = (self.compress, self.compress and is_depth_compressed)
         self._poses: list[FramePose] = []
-        if plan.truth is not None:
-            rows = zip(plan.truth.stamps_ns.tolist(), plan.truth.T_world_frame, strict=True)
+        if self.truth is not None:
+            rows = zip(self.truth.stamps_ns.tolist(), self.truth.T_world_frame, strict=True)
             self._poses = [FramePose(stamp_ns, *TRUTH_FRAMES, T) for stamp_ns, T in rows]
         self._is_empty = True
         self._bag = BagWriter(path, keeps_order=True)
@@ -81,7 +81,7 @@ class BagForm(Form):
 
     def images(self) -> Iterator[StampedImage]:
         """Yield all images."""
-        return self.plan.images()
+        return self.recorded()
 
     def write(self, image: StampedImage, pixels: NDArray[Any]) -> None:
         """Write the true poses up to an image, and the image beside its calibration."""
@@ -105,7 +105,7 @@ class BagForm(Form):
         # Whoever plays the bag knows the cameras before the first image or pose comes.
         stamp_ns = min([stamp_ns, *(pose.stamp_ns for pose in self._poses[:1])])
         first, second = self._streams
-        poses = static_poses(self.plan.source, (first.frame_id, second.frame_id), stamp_ns)
+        poses = static_poses(self.source, (first.frame_id, second.frame_id), stamp_ns)
         bag_messages.write_transforms(self._bag, "/tf_static", poses, is_latched=True)
 
     def _write_poses(self, until_ns: float = np.inf) -> None:

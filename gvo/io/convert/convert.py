@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from rosbags.rosbag1 import WriterError as WriterError1
 from rosbags.rosbag2 import WriterError as WriterError2
@@ -16,7 +16,7 @@ from gvo.errors import RecordingError, write_faults
 from gvo.io.bag.source import BagSource
 from gvo.io.convert.bag import BagForm
 from gvo.io.convert.folders import EurocForm, KittiForm, TumForm
-from gvo.io.convert.plan import Form, Plan
+from gvo.io.convert.plan import Form
 from gvo.io.opening import BAG_SUFFIXES
 from gvo.io.recording import RecordingInfo, Source
 from gvo.io.run_folder.line_file import check_new
@@ -111,15 +111,16 @@ def convert(
     _check(path, layout, compress=compress)
     layout = layout if layout == "bag" else _choose(source.info, layout, rectify=rectify)
     sync = (config or Config()).sync
-    plan = Plan(source, rectify=rectify or layout == "kitti", compress=compress, sync=sync)
+    rectify = rectify or layout == "kitti"
+    options: dict[str, Any] = {"rectify": rectify, "compress": compress, "sync": sync}
     n_images = [0, 0]
     with (
         write_faults(RecordingError, path, WriterError1, WriterError2),
         tempfile.TemporaryDirectory(dir=path.parent, prefix=".convert-") as folder,
     ):
-        with _FORMS[layout](Path(folder) / path.name, plan) as form:
+        with _FORMS[layout](Path(folder) / path.name, source, **options) as form:
             for image in form.images():
-                pixels = plan.pixels(image)
+                pixels = form.pixels(image)
                 if pixels is None:
                     continue
                 form.write(image, pixels)
@@ -128,13 +129,13 @@ def convert(
                     progress(sum(n_images))
             if not all(n_images):
                 name = source.info.stream_names[n_images.index(0)]
-                reason = "; ".join(plan.skipped[:1]) or "the recording holds none"
+                reason = "; ".join(form.skipped[:1]) or "the recording holds none"
                 raise RecordingError(
                     f"{source.info.name}: no {name} image can be written: {reason}"
                 )
             form.finish()
         form.path.rename(path)
-    return Conversion(path=path, n_images=sum(n_images), n_poses=form.n_poses, skipped=plan.skipped)
+    return Conversion(path=path, n_images=sum(n_images), n_poses=form.n_poses, skipped=form.skipped)
 
 
 def _check(path: Path, layout: Layout | None, *, compress: bool) -> None:

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
-from gvo.io.convert.plan import Form, Plan, pose_of_right, pose_on_body
+from gvo.io.convert.plan import Form, pose_of_right, pose_on_body
 from gvo.io.datasets.tum import DEFAULT_SCALE
 from gvo.io.frames import paired
 from gvo.io.images import MAX_COUNT, MILLIMETRES, encode_image, is_in_counts, to_counts
-from gvo.io.recording import StampedImage
+from gvo.io.recording import Source, StampedImage
 from gvo.trajectory.formats import write_euroc, write_kitti, write_tum
 from gvo.trajectory.trajectory import Trajectory, format_stamp
 from gvo.types import DepthArray, FaultyFrame, FloatArray
@@ -33,17 +33,17 @@ class KittiForm(Form):
     The stamp of a pair is that of the left image; unpaired images are left out.
     """
 
-    def __init__(self, path: Path, plan: Plan) -> None:
-        super().__init__(path, plan)
+    def __init__(self, path: Path, source: Source, **options: Any) -> None:  # noqa: ANN401
+        super().__init__(path, source, **options)
         self._stamps_ns: list[int] = []
         self._folders: tuple[str, str] | None = None
         path.mkdir()
 
     def images(self) -> Iterator[StampedImage]:
         """Yield the images of pairs, left before right; what cannot be read keeps its number."""
-        for pair in paired(self.plan.images(), self.plan.info.sensor, self.plan.sync):
+        for pair in paired(self.recorded(), self.info.sensor, self.sync):
             if isinstance(pair, FaultyFrame):
-                self.plan.leave_out(0, pair.stamp_ns, pair.reason)
+                self.leave_out(0, pair.stamp_ns, pair.reason)
             else:
                 self._stamps_ns.append(pair[0].stamp_ns)
                 yield from pair
@@ -60,28 +60,28 @@ class KittiForm(Form):
 
     def finish(self) -> None:
         """Write stamps, calibration, and a pose for each pair where all of them have one."""
-        if self.plan.truth is not None:
-            self._write_truth(self.plan.truth)
+        if self.truth is not None:
+            self._write_truth(self.truth)
         times = "".join(f"{format_stamp(stamp_ns)}\n" for stamp_ns in self._stamps_ns)
         (self.path / "times.txt").write_text(times, encoding="utf-8")
         # P of left and right: `PN` of `image_N`.
         names = self._folders or ("image_0", "image_1")
         lines = [
             f"P{name[-1]}: {' '.join(map(repr, _numbers(calibration.P)))}\n"
-            for name, calibration in zip(names, self.plan.calibrations, strict=True)
+            for name, calibration in zip(names, self.calibrations, strict=True)
         ]
         (self.path / "calib.txt").write_text("".join(lines), encoding="utf-8")
 
     def _write_truth(self, truth: Trajectory) -> None:
         at_frames = truth.interpolate(np.array(self._stamps_ns, dtype=np.int64))
         if len(at_frames) < len(self._stamps_ns):
-            self.plan.notes.append(
+            self.notes.append(
                 f"poses.txt: {len(at_frames)} of {len(self._stamps_ns)} pairs lie between true "
                 "poses, all are needed"
             )
             return
         # The layout's poses are those of the camera that P is stated for: P = K [I | t_cam_cam0].
-        P = self.plan.info.calibrations[0].P
+        P = self.info.calibrations[0].P
         t_cam_cam0 = np.linalg.solve(P[:, :3], P[:, 3])
         T_cam_cam0 = se3.make_transform(np.eye(3), np.asarray(t_cam_cam0))
         write_kitti(self.path / "poses.txt", at_frames.transformed(T_cam_cam0))
@@ -94,11 +94,11 @@ class EurocForm(Form):
     Where the recording does not place its cameras on a body, the rectified left camera is it.
     """
 
-    def __init__(self, path: Path, plan: Plan) -> None:
-        super().__init__(path, plan)
+    def __init__(self, path: Path, source: Source, **options: Any) -> None:  # noqa: ANN401
+        super().__init__(path, source, **options)
         self._root = path / "mav0"
         self._tables: tuple[list[str], list[str]] = ([], [])
-        T_body_cam = pose_on_body(plan.source)
+        T_body_cam = pose_on_body(self.source)
         self._T_body_cam = np.eye(4) if T_body_cam is None else T_body_cam
         for name in ("cam0", "cam1"):
             (self._root / name / "data").mkdir(parents=True)
@@ -116,25 +116,23 @@ class EurocForm(Form):
             camera = self._root / f"cam{stream}"
             text = "#timestamp [ns],filename\n" + "".join(rows)
             (camera / "data.csv").write_text(text, encoding="utf-8")
-            written = self.plan.calibrations[stream]
-            T_left_rectified = pose_of_right(self.plan.info) if stream == 1 else np.eye(4)
+            written = self.calibrations[stream]
+            T_left_rectified = pose_of_right(self.info) if stream == 1 else np.eye(4)
             T_rectified_written = se3.make_transform(written.R, np.zeros(3))
             T_body_written = self._T_body_cam @ T_left_rectified @ T_rectified_written
             _write_sensor_yaml(camera / "sensor.yaml", written, T_body_written)
-        if self.plan.truth is not None:
+        if self.truth is not None:
             folder = self._root / "state_groundtruth_estimate0"
             folder.mkdir()
-            write_euroc(
-                folder / "data.csv", self.plan.truth.transformed(se3.invert(self._T_body_cam))
-            )
-            self.n_poses = len(self.plan.truth)
+            write_euroc(folder / "data.csv", self.truth.transformed(se3.invert(self._T_body_cam)))
+            self.n_poses = len(self.truth)
 
 
 class TumForm(Form):
     """Colour and depth by stamp, with `calibration.yaml`."""
 
-    def __init__(self, path: Path, plan: Plan) -> None:
-        super().__init__(path, plan)
+    def __init__(self, path: Path, source: Source, **options: Any) -> None:  # noqa: ANN401
+        super().__init__(path, source, **options)
         self._tables: tuple[list[str], list[str]] = ([], [])
         self._scale: float | None = None
         self._n_cut = 0
@@ -159,14 +157,14 @@ class TumForm(Form):
             text = f"# {name} images\n# stamp filename\n" + "".join(rows)
             (self.path / f"{name}.txt").write_text(text, encoding="utf-8")
         path = self.path / "calibration.yaml"
-        _write_camera_info_yaml(path, self.plan.calibrations[0], depth_scale=scale)
+        _write_camera_info_yaml(path, self.calibrations[0], depth_scale=scale)
         if self._n_cut:
-            self.plan.notes.append(
+            self.notes.append(
                 f"depth: {self._n_cut} pixels beyond {MAX_COUNT / scale:.1f} m became unknown"
             )
-        if self.plan.truth is not None:
-            write_tum(self.path / "groundtruth.txt", self.plan.truth)
-            self.n_poses = len(self.plan.truth)
+        if self.truth is not None:
+            write_tum(self.path / "groundtruth.txt", self.truth)
+            self.n_poses = len(self.truth)
 
 
 def _choose_scale(depth: DepthArray) -> float | None:

@@ -29,11 +29,15 @@ BODY_FRAME = "body"
 _Preparers: TypeAlias = tuple[ImagePreparer | None, ImagePreparer | None]
 
 
-class Plan:
-    """The images as they are written, with their calibrations; true poses; what is left out.
+class Form(AbstractContextManager["Form"], ABC):
+    """A new bag or folder: takes images one by one inside a `with` block, in the end `finish`.
 
     Attributes
     ----------
+    path : Path
+        The file or folder.
+    n_poses : int
+        True poses written, once it is finished.
     calibrations : tuple of Calibration
         Of the images as they are written.
     truth : Trajectory or None
@@ -45,11 +49,12 @@ class Plan:
     """
 
     def __init__(
-        self, source: Source, *, rectify: bool, compress: bool = False, sync: SyncConfig
+        self, path: Path, source: Source, *, rectify: bool, compress: bool, sync: SyncConfig
     ) -> None:
-        self.source, self.info, self.sync = source, source.info, sync
+        self.path, self.source, self.info, self.sync = path, source, source.info, sync
         self.rectify, self.compress = rectify, compress
         self.names = tuple(f"{name} images" for name in self.info.stream_names)
+        self.n_poses = 0
         self.notes: list[str] = []
         self._faults = InputFaults()
         self.calibrations, self._preparers = plan_images(self.info, rectify=rectify)
@@ -60,7 +65,7 @@ class Plan:
         """All that is left out, a line each; images are counted."""
         return (*self.notes, *self._faults.warnings())
 
-    def images(self) -> Iterator[StampedImage]:
+    def recorded(self) -> Iterator[StampedImage]:
         """Yield the images up to where the recording cannot be read on; note why."""
         try:
             yield from self.source.images()
@@ -94,32 +99,17 @@ class Plan:
         )
         return None
 
-
-class Form(AbstractContextManager["Form"], ABC):
-    """A new bag or folder: takes images one by one inside a `with` block, in the end `finish`.
-
-    Attributes
-    ----------
-    path : Path
-        The file or folder.
-    n_poses : int
-        True poses written, once it is finished.
-    """
-
-    def __init__(self, path: Path, plan: Plan) -> None:
-        self.path, self.plan, self.n_poses = path, plan, 0
-
     def __exit__(self, *exception: object) -> None:
         """Close what is open."""
 
     def images(self) -> Iterator[StampedImage]:
         """Yield the images that the form can hold: those with a stamp of their own."""
         last_ns: list[int | None] = [None, None]
-        for image in self.plan.images():
+        for image in self.recorded():
             before_ns = last_ns[image.stream]
             if before_ns is not None and image.stamp_ns <= before_ns:
                 reason = f"the stamp does not advance from {before_ns} ns"
-                self.plan.leave_out(image.stream, image.stamp_ns, reason)
+                self.leave_out(image.stream, image.stamp_ns, reason)
                 continue
             last_ns[image.stream] = image.stamp_ns
             yield image
