@@ -42,14 +42,12 @@ class Prediction(NamedTuple):
 class Gated(NamedTuple):
     """The start value of a pose, its accepted edges, and the others with the reasons.
 
-    The start is the weighted mean of the predictions that agree with their medoid; the misfit is
-    how far they lie from it, in squared sigmas per degree of freedom (NaN of a single one).
+    The start is the weighted mean of the predictions that agree with their medoid.
     """
 
     T_world_start: gtsam.Pose3
     accepted: list[Measurement]
     refused: list[tuple[Edge, str]]
-    misfit: float
 
 
 def gate_edges(
@@ -88,13 +86,12 @@ def gate_edges(
             reasons = _outvoted(voters, len(predictions), relative_covariance, gate=gate)
         is_accepted = np.array([not reason for reason in reasons])
         near = [*compress(predictions, _near_medoid(distances, is_accepted))]
-        T_world_start, spread, _ = _fit(near)
+        T_world_start, _, _ = _fit(near)
     pairs = list(zip(predictions, reasons, strict=True))
     return Gated(
         T_world_start=T_world_start,
         accepted=[each.measurement for each, reason in pairs if not reason],
         refused=[(each.edge, reason) for each, reason in pairs if reason],
-        misfit=spread / (6.0 * (len(near) - 1)) if len(near) > 1 else math.nan,
     )
 
 

@@ -9,7 +9,6 @@ M. Kaess et al., "iSAM2: Incremental smoothing and mapping using the Bayes tree"
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -73,7 +72,6 @@ class NewPose:
     support: Edge | PosePrior | None = None
     rejected: tuple[Rejected, ...] = ()
     n_gated: int = 0
-    misfit: float = math.nan
 
     @property
     def is_measured(self) -> bool:

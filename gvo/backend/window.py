@@ -100,11 +100,11 @@ class SlidingWindow:
     ----------
     variance_factor : float
         By which covariances are multiplied that are given out: what those of all edges turned out
-        to be too large by. Poses and gates do not depend on it.
+        to be wrong by. Poses and gates do not depend on it.
     misfit : float
-        How far the places that the edges of the last pose lead to lie from their mean, in squared
-        sigmas per degree of freedom: about one if their covariances are true. NaN with less than
-        two edges.
+        How far the places that the edges of the last pose lead to, from their references as they
+        were given out, lie from their mean, in squared sigmas per degree of freedom: about one if
+        covariances are true. NaN with less than two edges.
 
     Examples
     --------
@@ -242,7 +242,7 @@ class SlidingWindow:
         )
         self._graph.keep_causal(estimate)
         self._count(new)
-        self.misfit = new.misfit
+        self.misfit = self._misfit(new)
         self._update_motion(new, estimate)
         if self._keeps_by_distance and frame_id in self:
             self._keep_by_distance(frame_id)
@@ -421,6 +421,26 @@ class SlidingWindow:
             return estimate
         return replace(estimate, covariance=self.variance_factor * estimate.covariance)
 
+    def _misfit(self, new: NewPose) -> float:
+        """Return how far the edges of a pose disagree, from references as they were given out.
+
+        Smoothed since, these have been drawn to where the edges to come lead.
+        """
+        total, information, squares, n, T_first = np.zeros(6), np.zeros((6, 6)), 0.0, 0, None
+        for measurement in new.measurements:
+            reference = self._poses.get(measurement.edge.reference_id)
+            if reference is None or reference.causal is None:
+                continue
+            T = reference.causal.T_world_frame @ measurement.edge.T_reference_frame
+            T_first = T if T_first is None else T_first
+            twist, of_one = se3.log(se3.invert(T_first) @ T), measurement.gaussian.information()
+            weighted = of_one @ twist
+            total, information = total + weighted, information + of_one
+            squares, n = squares + float(twist @ weighted), n + 1
+        if n < 2:
+            return math.nan
+        return (squares - float(total @ np.linalg.solve(information, total))) / (6.0 * (n - 1))
+
     def _count(self, new: NewPose) -> None:
         self._counted["n_poses"] += 1
         self._counted["n_edges"] += len(new.measurements)
@@ -460,7 +480,6 @@ class SlidingWindow:
             support=support,
             rejected=tuple(_refusal(frame_id, stamp_ns, *each) for each in refused),
             n_gated=len(gated.refused),
-            misfit=gated.misfit,
         )
 
     def _gate(
@@ -469,7 +488,7 @@ class SlidingWindow:
         """Gate edges against each other; without any, return what constrains the pose instead."""
         if not predictions:
             T_world_start, support = self._start(stamp_ns, prior)
-            return Gated(T_world_start, [], [], math.nan), support
+            return Gated(T_world_start, [], []), support
         gated = gate_edges(
             predictions,
             relative_covariance=self._graph.relative_covariance,
@@ -554,7 +573,6 @@ class SlidingWindow:
             prior=None,
             support=support,
             rejected=(*new.rejected, *(_refusal(*ends, edge, reason) for edge in edges)),
-            misfit=math.nan,
         )
 
     def _extend(

@@ -52,10 +52,11 @@ _ROW_KERNEL_PX = 0.15
 _N_ROW_STEPS = 3
 # Corners whose rows are looked at in a frame, at least and at most.
 _MIN_ROWS, _MAX_ROWS = 50, 120
-# Misfits that a variance factor is averaged over; the largest, per degree of freedom; and the share
-# of the variance that errors are taken to have which registrations of the same motion share.
+# Misfits that a variance factor is averaged over; by how much one may be larger than their mean, or
+# than ten, per degree of freedom; and the share of the variance that errors are taken to have which
+# registrations of the same motion share.
 _N_MISFITS = 30
-_MAX_MISFIT = 2.0
+_MAX_MISFIT = 10.0
 _SHARED = 0.25
 
 
@@ -151,11 +152,12 @@ class ConstantFilter:
 
 
 class VarianceFactor:
-    """What the inflation of registrations' covariances should have been, by those that agree.
+    """By how much registrations' covariances are wrong, by how far those of one motion differ.
 
     A link to a keyframe and the steps since then measure the same motion. Where they differ by less
-    than stated, errors of neighbouring tracks correlate less than `sigma_factor` assumes. Errors
-    that both share, they do not show: a part of the assumption always stays.
+    than stated, errors of neighbouring tracks correlate less than `sigma_factor` assumes; by more,
+    they correlate more. Errors that both share, they do not show: a part of what is stated always
+    stays.
 
     Parameters
     ----------
@@ -165,7 +167,7 @@ class VarianceFactor:
     Attributes
     ----------
     value : float
-        By which the stated covariances are to be multiplied, at most one.
+        By which the stated covariances are to be multiplied.
 
     References
     ----------
@@ -185,9 +187,9 @@ class VarianceFactor:
         """
         if not math.isfinite(misfit):
             return
-        self._mean += (min(misfit, _MAX_MISFIT) - self._mean) / _N_MISFITS
-        value = _SHARED + (1.0 - _SHARED) * self._mean
-        self.value = min(max(value, self._least), 1.0)
+        misfit = min(misfit, _MAX_MISFIT * max(self._mean, 1.0))
+        self._mean += (misfit - self._mean) / _N_MISFITS
+        self.value = max(_SHARED + (1.0 - _SHARED) * self._mean, self._least)
 
 
 class RigOffsets:

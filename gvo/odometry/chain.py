@@ -53,7 +53,9 @@ class RawStep:
     Parameters
     ----------
     estimate : Estimate
-        Pose of the frame by the chain.
+        Pose of the frame by the chain, with the covariance that registrations state.
+    covariance : ndarray of float64, shape (6, 6)
+        Of it, by what those turned out to be wrong by.
     edge : Edge or None
         From the frame that the step starts from, named by its stamp; None for the first frame.
     registration : RelativePose or None
@@ -67,6 +69,7 @@ class RawStep:
     """
 
     estimate: Estimate
+    covariance: FloatArray
     edge: Edge | None = None
     registration: RelativePose | None = None
     failure: Failure | None = None
@@ -81,6 +84,7 @@ class _Node(Generic[ObservationsT]):
     frame: Stamped
     observations: ObservationsT
     estimate: Estimate
+    covariance: FloatArray
     n_steps: int = 0
 
 
@@ -135,7 +139,7 @@ class RawChain(Generic[ObservationsT]):
         current : observations
             Of the frame.
         variance_factor : float
-            Of the step's covariance in that of the chain.
+            By which the covariance that the step states is wrong.
         seeks_places : bool
             A camera that was lost looks for places itself: nothing predicts how far it is from the
             last registered frame, and one registration alone may be of a view that looks alike.
@@ -149,12 +153,16 @@ class RawChain(Generic[ObservationsT]):
         if not self._nodes:
             T, covariance = np.eye(4), np.zeros((6, 6))
             first = Estimate(stamp_ns=current.stamp_ns, T_world_frame=T, covariance=covariance)
-            step = RawStep(estimate=first)
+            step = RawStep(estimate=first, covariance=covariance)
         else:
             self._check_stamp(current.stamp_ns)
             step, anchors = self._follow(current, variance_factor, seeks_places=seeks_places)
         newest = _Node(
-            frame=frame, observations=current, estimate=step.estimate, n_steps=step.n_steps
+            frame=frame,
+            observations=current,
+            estimate=step.estimate,
+            covariance=step.covariance,
+            n_steps=step.n_steps,
         )
         self._nodes = [newest, *anchors]
         return step
@@ -221,10 +229,11 @@ class RawChain(Generic[ObservationsT]):
         T, covariance, reference = result.T_reference_current, result.covariance, node.estimate
         # What the next step takes back is not chained: with it the raw NEES over 1 s of rendered
         # hands with a rolling shutter falls from 0.6 to 0.4, and covariances are too large.
-        lasting = variance_factor * (covariance - result.passing_covariance)
+        lasting = covariance - result.passing_covariance
         elapsed_s = 1e-9 * (stamp_ns - reference.stamp_ns)
         return RawStep(
             estimate=go_on(reference, stamp_ns, T, lasting),
+            covariance=se3.compose_covariance(node.covariance, T, variance_factor * lasting),
             edge=Edge(reference_id=reference.stamp_ns, T_reference_frame=T, covariance=covariance),
             registration=result,
             is_steady=self._note_velocity(stamp_ns, result, elapsed_s),
@@ -249,6 +258,7 @@ class RawChain(Generic[ObservationsT]):
         before_ns = before.estimate.stamp_ns
         return RawStep(
             estimate=go_on(before.estimate, stamp_ns, T, covariance, Status.COASTING),
+            covariance=se3.compose_covariance(before.covariance, T, covariance),
             edge=Edge(reference_id=before_ns, T_reference_frame=T, covariance=covariance),
             failure=failure,
             n_steps=before.n_steps + _N_STEPS_COASTED,

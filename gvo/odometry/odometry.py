@@ -291,7 +291,7 @@ class Odometry:
         for estimate in (step.estimate, causal):
             self._poses.extend(estimate.T_world_frame[:3].ravel())
         return FrameResult(
-            raw=replace(step.estimate, frame_id=step.estimate.stamp_ns),
+            raw=replace(step.estimate, frame_id=step.estimate.stamp_ns, covariance=step.covariance),
             causal=causal,
             finished=finished,
             status=causal.status,
@@ -441,9 +441,7 @@ class Odometry:
         """Tell the front-end how well a link agrees with the raw chain since its keyframe."""
         offsets = self._frontend.rig_offsets
         if offsets is not None and end.stamp_ns - start.stamp_ns >= _MIN_LOOP_NS:
-            factor = offsets.chain_factor
-            scaled = replace(link, covariance=factor.value * link.covariance)
-            factor.note(factor.value * misclosure(scaled, start, end))
+            offsets.chain_factor.note(misclosure(link, start, end))
 
     def _align_depths(self, observations: _Observations, links: list[Edge]) -> list[Edge]:
         """Return what depth alone measured beside links, where colour contradicts it."""

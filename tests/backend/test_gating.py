@@ -172,23 +172,6 @@ def refused_of(verdict: Gated, edges: list[Edge]) -> set[int]:
     return refused
 
 
-@pytest.mark.parametrize("n", [2, 5])
-@pytest.mark.parametrize("scale", [0.5, 1.0])
-def test_the_misfit_of_edges_is_the_variance_of_their_errors_in_what_is_stated(
-    n: int, scale: float
-) -> None:
-    rng, misfits = np.random.default_rng(3), []
-    for _ in range(200):
-        covariances = [random_covariance(rng, 1e-3) for _ in range(n)]
-        noises = [scale * rng.multivariate_normal(np.zeros(6), each) for each in covariances]
-        edges = [
-            edge(0, se3.exp(noise), each) for noise, each in zip(noises, covariances, strict=True)
-        ]
-        misfits.append(verdict_of(edges, {0: np.eye(4)}, gate=10.0).misfit)
-    assert np.mean(misfits) == pytest.approx(scale**2, rel=0.1)
-    assert np.isnan(verdict_of(edges[:1], {0: np.eye(4)}, gate=10.0).misfit)
-
-
 @pytest.mark.parametrize("gate", [None, 1e-3, 10.0])
 @settings(max_examples=10)
 @given(seed=seeds, n=st.integers(3, 6), n_wrong=st.integers(0, 1))

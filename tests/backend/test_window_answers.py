@@ -339,6 +339,41 @@ def test_without_keyframes_nobody_is_kept() -> None:
     assert drive([shifted(z=2.0)] * 5, config_of(n_keyframes=0)) == [[]] * 6
 
 
+# How far edges agree.
+
+
+@pytest.mark.parametrize("n", [2, 5])
+@pytest.mark.parametrize("scale", [0.5, 1.0])
+def test_the_misfit_of_edges_is_the_variance_of_their_errors_in_what_is_stated(
+    n: int, scale: float
+) -> None:
+    rng, misfits = np.random.default_rng(3), []
+    for _ in range(200):
+        sigmas = 10.0 ** rng.uniform(-4.0, -2.0, (n, 6))
+        noises = scale * sigmas * rng.normal(size=(n, 6))
+        window = SlidingWindow()
+        window.add_pose(0, 0, [])
+        edges = [
+            Edge(reference_id=0, T_reference_frame=se3.exp(noise), covariance=np.diag(of_one**2))
+            for noise, of_one in zip(noises, sigmas, strict=True)
+        ]
+        window.add_pose(1, STEP_NS, edges)
+        misfits.append(window.misfit)
+    assert np.mean(misfits) == pytest.approx(scale**2, rel=0.1)
+    window.add_pose(2, 2 * STEP_NS, [edge(1, STEP)])
+    assert np.isnan(window.misfit)
+
+
+def test_edges_are_compared_from_their_references_as_these_were_given_out() -> None:
+    window, off = SlidingWindow(), shifted(x=0.02)
+    window.add_pose(0, 0, [])
+    window.add_pose(1, STEP_NS, [edge(0, STEP @ off)])
+    assert window.add_edge(1, edge(0, STEP, 1e-5))
+    np.testing.assert_allclose(window.pose(1), STEP, atol=1e-4)
+    window.add_pose(2, 2 * STEP_NS, [edge(1, STEP), edge(0, STEP @ STEP)])
+    assert window.misfit == pytest.approx(0.5 * (0.02 / 0.01) ** 2 / 6.0, rel=0.01)
+
+
 # From one start to the next.
 
 

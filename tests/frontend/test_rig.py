@@ -104,19 +104,19 @@ def test_what_is_not_told_stays_at_the_prior() -> None:
     [
         (0.2, 2.4, 0.4),
         (1.0, 2.4, 1.0),
-        (50.0, 2.4, 1.0),  # never wider than assumed
+        (50.0, 2.4, 0.25 + 0.75 * 50.0),
         (0.2, 1.2, 1.2**-2),  # never surer than residuals are
         (0.2, 0.9, 1.0),
     ],
 )
-def test_an_inflation_is_taken_back_as_far_as_registrations_agree_better(
+def test_covariances_are_wrong_by_as_much_as_registrations_agree_better_or_worse(
     misfit: float, sigma_factor: float, expected: float
 ) -> None:
     factor = VarianceFactor(sigma_factor)
     for _ in range(300):
         factor.note(misfit)
         factor.note(math.nan)
-    assert factor.value == pytest.approx(expected, abs=1e-3)
+    assert factor.value == pytest.approx(expected, rel=1e-2)
 
 
 def test_one_misfit_far_off_does_not_undo_what_many_showed() -> None:
@@ -124,7 +124,7 @@ def test_one_misfit_far_off_does_not_undo_what_many_showed() -> None:
     for _ in range(300):
         factor.note(0.2)
     factor.note(1e9)
-    assert factor.value < 0.5
+    assert factor.value < 0.7
 
 
 def test_what_is_noted_counts_from_the_next_frame_and_once() -> None:

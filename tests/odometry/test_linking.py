@@ -35,6 +35,7 @@ def step_of(*, is_registered: bool = True, is_steady: bool = True) -> RawStep:
         estimate=Estimate(
             stamp_ns=100, T_world_frame=np.eye(4), covariance=covariance, status=Status.OK
         ),
+        covariance=covariance,
         edge=Edge(reference_id=90, T_reference_frame=forward(1.0), covariance=covariance),
         registration=registration if is_registered else None,
         failure=None if is_registered else Failure(reason="blank"),

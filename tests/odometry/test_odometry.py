@@ -520,15 +520,15 @@ def test_covariances_shrink_to_what_loops_show_and_no_pose_moves(empty: int) -> 
             offsets = frontend.rig_offsets
             values = [offsets.chain_factor.value, offsets.window_factor.value]
             assert values[0] == pytest.approx(0.25 + 0.75 / 4.0, abs=0.12)
-            # Edges of one frame differ by what their references do, too.
-            assert values[0] < values[1] < 0.75
+            # Edges of one frame differ by what their references did when they were given out, too.
+            assert values[0] < values[1] < 2.0
     for learnt, stated in zip(*runs, strict=True):
         for kind in ("raw", "causal"):
             one, other = getattr(learnt, kind), getattr(stated, kind)
             np.testing.assert_array_equal(one.T_world_frame, other.T_world_frame)
     learnt, stated = (run[-1] for run in runs)
     # Where the chain was broken the window's rest on a guess, which is as uncertain as before.
-    assert factors == [pytest.approx(values[1], abs=0.05) if empty < 0 else 1.0, 1.0]
+    assert factors == [pytest.approx(values[1], rel=0.1) if empty < 0 else 1.0, 1.0]
     expected = factors[0] * stated.causal.covariance
     np.testing.assert_allclose(learnt.causal.covariance, expected, rtol=1e-9)
     if empty < 0:
