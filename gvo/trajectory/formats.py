@@ -65,7 +65,8 @@ def read_trajectory(path: str | Path, *, is_growing: bool = False) -> Trajectory
         Text; fields are separated by blanks, commas or semicolons, comments start with #.
     is_growing : bool
         A TUM file that is still being written: it may be missing or empty, its rows may be in any
-        order, and an incomplete last line is ignored.
+        order, and an incomplete last line is ignored. Poses and covariances may be a line ahead
+        of one another: those of both come.
 
     Returns
     -------
@@ -87,7 +88,8 @@ def read_trajectory(path: str | Path, *, is_growing: bool = False) -> Trajectory
     if not sample:
         raise TrajectoryError(f"{path}: holds no poses; expected rows like TUM's: {_TUM_ROW}")
     if is_growing:
-        return _read(path, chain(sample, rows), TUM, n_columns=8, is_sorted=False)
+        poses = _read(path, chain(sample, rows), TUM, n_columns=8, is_sorted=False)
+        return _with_covariances(poses, path, is_growing=True)
     header = list(sample[0].comments)
     if len(sample) > 1 and not any(map(_NUMBER.match, sample[0].fields)):
         header.append(sample.pop(0).text)
@@ -113,24 +115,26 @@ def _recognise(rows: Sequence[Row], header: Sequence[str]) -> Form:
         raise first.error(str(error)) from None
 
 
-def _with_covariances(trajectory: Trajectory, path: Path) -> Trajectory:
+def _with_covariances(
+    trajectory: Trajectory, path: Path, *, is_growing: bool = False
+) -> Trajectory:
     beside = path.with_name(f"{path.stem}_covariance.csv")
-    stamps_ns, covariances = read_covariances(beside, is_growing=True)
-    _, _, rows = np.intersect1d(trajectory.stamps_ns, stamps_ns, return_indices=True)
+    stamps_ns, covariances = read_covariances(beside)
+    _, own, rows = np.intersect1d(trajectory.stamps_ns, stamps_ns, return_indices=True)
+    if is_growing and beside.is_file():
+        trajectory = trajectory.select(own)
     is_whole = len(rows) == len(trajectory)
     return replace(trajectory, covariances=covariances[rows]) if is_whole else trajectory
 
 
-def read_covariances(path: str | Path, *, is_growing: bool = False) -> tuple[IntArray, FloatArray]:
-    """Read the covariances of a run folder.
+def read_covariances(path: str | Path) -> tuple[IntArray, FloatArray]:
+    """Read the covariances of a run folder, also of a run that goes on.
 
     Parameters
     ----------
     path : str or Path
-        CSV with `COVARIANCE_HEADER` as its first line.
-    is_growing : bool
-        It is still being written: it may be missing or empty, and an incomplete last line is
-        ignored.
+        CSV with `COVARIANCE_HEADER` as its first line. It may be missing or empty, and an
+        incomplete last line is ignored.
 
     Returns
     -------
@@ -141,14 +145,14 @@ def read_covariances(path: str | Path, *, is_growing: bool = False) -> tuple[Int
     Raises
     ------
     TrajectoryError
-        If the file is missing or malformed.
+        If the file is malformed.
     """
     path = Path(path)
-    rows = read_rows(path, is_growing=is_growing)
+    rows = read_rows(path, is_growing=True)
     first = next(rows, None)
-    if is_growing and first is None:
+    if first is None:
         return np.empty(0, dtype=np.int64), np.empty((0, 6, 6))
-    if first is None or first.fields != COVARIANCE_HEADER.split(","):
+    if first.fields != COVARIANCE_HEADER.split(","):
         raise TrajectoryError(f"{path}:1: expected the header {COVARIANCE_HEADER[:32]}...")
     table = read_table(path, rows, slice(1, 22), n_columns=22, unit_ns=1, limit=math.inf)
     return table.stamps_ns, from_upper_triangle(table.values)

@@ -260,7 +260,7 @@ def test_positions_without_rotations_are_no_file_of_poses(tmp_path: Path) -> Non
 def test_growing_files_are_read_as_far_as_they_go_and_sorted(tmp_path: Path) -> None:
     poses, covariances = tmp_path / "poses.txt", tmp_path / "covariances.csv"
     assert len(read_trajectory(poses, is_growing=True)) == 0
-    assert [len(part) for part in read_covariances(covariances, is_growing=True)] == [0, 0]
+    assert [len(part) for part in read_covariances(covariances)] == [0, 0]
     trajectory = random_trajectory(3)
     write_tum(poses, trajectory)
     write_covariances(covariances, trajectory)
@@ -269,6 +269,6 @@ def test_growing_files_are_read_as_far_as_they_go_and_sorted(tmp_path: Path) -> 
     covariances.write_text(covariances.read_text()[:-1])
     expected = trajectory.stamps_ns[:-1].tolist()
     assert read_trajectory(poses, is_growing=True).stamps_ns.tolist() == expected
-    stamps_ns, found = read_covariances(covariances, is_growing=True)
+    stamps_ns, found = read_covariances(covariances)
     assert stamps_ns.tolist() == expected
     assert len(found) == len(expected)

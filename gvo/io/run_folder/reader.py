@@ -18,7 +18,7 @@ from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
 from gvo.io.run_folder.writer import GLOBAL, POSITIONS_HEADER, TRAJECTORIES, TRUE_POSITIONS, TRUTH
 from gvo.trajectory.evaluation import SMOOTHED_GLOBAL
-from gvo.trajectory.formats import MAX_LINES, MAX_POSITION_M, read_covariances, read_trajectory
+from gvo.trajectory.formats import MAX_LINES, MAX_POSITION_M, read_trajectory
 from gvo.trajectory.trajectory import StampsFrom, Trajectory
 from gvo.types import FloatArray
 
@@ -149,7 +149,10 @@ def read_run(folder: str | Path) -> RunRecord:
         raise RecordingError(f"{folder}: is not a run folder: {missing[0]} is missing; {_EXPECTED}")
     summary = _read_summary(folder / "summary.json")
     tables = {name: _read_table(folder / f"{name}.csv", _REQUIRED[name]) for name in _REQUIRED}
-    trajectories = {name: _read_estimate(folder, name) for name in trajectory_names(folder)}
+    trajectories = {
+        name: read_trajectory(folder / f"{name}.txt", is_growing=True)
+        for name in trajectory_names(folder)
+    }
     return RunRecord(
         folder=folder,
         summary=summary,
@@ -249,19 +252,6 @@ _CONVERTERS: dict[type, Callable[[str], object]] = {
     np.int64: int,
     np.float64: lambda text: float(text or "nan"),
 }
-
-
-def _read_estimate(folder: Path, name: str) -> Trajectory:
-    """Read poses and covariances; in the middle of a run either may be a line ahead."""
-    if not (folder / f"{name}.txt").is_file():
-        return Trajectory.of([])
-    poses = read_trajectory(folder / f"{name}.txt", is_growing=True)
-    path = folder / f"{name}_covariance.csv"
-    if not path.is_file():
-        return replace(poses, covariances=None)
-    stamps_ns, covariances = read_covariances(path, is_growing=True)
-    _, first, second = np.intersect1d(poses.stamps_ns, stamps_ns, return_indices=True)
-    return replace(poses.select(first), covariances=covariances[second])
 
 
 def _read_truth(folder: Path, summary: dict[str, Any]) -> Trajectory | None:
