@@ -109,8 +109,12 @@ def test_errors_stay_below_their_limits(recording: Callable[[str], Source], name
     # Of some two dozen seeds one leaves freiburg1_rpy with a wrong step: the second best of three.
     seeds = [0] if name in RENDERED else [0, 1, 2]
     source = recording(name)
-    misses = [exceeded(name, *evaluations(source, f"ransac.seed={seed}")) for seed in seeds]
-    assert sorted(misses, key=len)[len(seeds) // 2] == []
+    misses: list[list[str]] = []
+    for seed in seeds:
+        misses.append(exceeded(name, *evaluations(source, f"ransac.seed={seed}")))
+        if misses.count([]) > len(seeds) // 2:  # whatever the rest would give
+            return
+    pytest.fail(str(misses))
 
 
 @pytest.mark.recorded
