@@ -165,16 +165,9 @@ def _find_motion(
     stamps_ns = measured.frames[0].stamp_ns, measured.frames[1].stamp_ns
     consensus = find_consensus(matches, camera, config, stamps_ns, T_start)
     moved = np.abs(matches.current_uvd - frontend.rig_offsets.take_off(measured.uvd[1]))
-    motion: dict[str, Any] = {
-        "n_consensus": 0,
-        "is_known": False,
-        "inliers": np.zeros(len(matches), np.bool_),
-        "residuals_px": None,
-        "whitened": None,
-        "row_motion_px": float(moved.max(initial=0.0)),
-    }
+    motion: dict[str, Any] = {"row_motion_px": float(moved.max(initial=0.0))}
     if isinstance(consensus, Failure):
-        return motion
+        return motion | {"inliers": np.zeros(len(matches), np.bool_)}
     motion["n_consensus"] = int(np.count_nonzero(consensus.inliers))
     motion["is_known"] = consensus.T_reference_current is T_start
     if isinstance(result, Failure):

@@ -123,11 +123,11 @@ class Registration:
     matches: Sorting
     radius_px: float
     is_predicted: bool
-    n_consensus: int
-    is_known: bool
+    n_consensus: int = 0
+    is_known: bool = False
     inliers: BoolArray
-    residuals_px: FloatArray | None
-    whitened: FloatArray | None
+    residuals_px: FloatArray | None = None
+    whitened: FloatArray | None = None
     row_motion_px: float
 
 

@@ -19,6 +19,7 @@ from gvo.geometry import se3
 from gvo.io.bag.messages import bare
 from gvo.io.bag.source import BagSource
 from gvo.io.poses.tf import TfBuffer, list_names
+from gvo.io.poses.truth import moved
 from gvo.io.recording import Source
 from gvo.trajectory.g2o import transforms_of
 from gvo.trajectory.trajectory import Trajectory
@@ -219,10 +220,8 @@ class BaseFrame:
             return trajectory.transformed(se3.invert(self.fixed_mount))
         found = [self._mount_at(int(stamp_ns)) for stamp_ns in trajectory.stamps_ns]
         is_known = np.array([not is_guessed for _, is_guessed in found], dtype=np.bool_)
-        T_base_cam = np.array([T for T, _ in found]).reshape(-1, 4, 4)[is_known]
-        known = trajectory.select(is_known)
-        T_world_frame = known.T_world_frame @ se3.invert(T_base_cam)
-        return replace(known, T_world_frame=T_world_frame, covariances=None)
+        T_base_cam = np.array([T for T, _ in found]).reshape(-1, 4, 4)
+        return moved(trajectory, se3.invert(T_base_cam), is_known)
 
 
 def find_base_frame(

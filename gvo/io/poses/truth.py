@@ -311,7 +311,8 @@ def _between(
 def moved(trajectory: Trajectory, T_frame_other: FloatArray, is_known: BoolArray) -> Trajectory:
     """Return poses of another frame of the same body, where its place is known."""
     known = trajectory.select(is_known)
-    return replace(known, T_world_frame=known.T_world_frame @ T_frame_other[is_known])
+    T_world_other = known.T_world_frame @ T_frame_other[is_known]
+    return replace(known, T_world_frame=T_world_other, covariances=None)
 
 
 def _brought(
