@@ -22,7 +22,7 @@ from gvo.io.bag.messages import (
     decode_grey_or_color,
     stamp_of,
 )
-from gvo.io.bag.reader import TF_TYPE, BagMessage, BagReader, find_files, serialize
+from gvo.io.bag.reader import TF_TYPE, BagMessage, BagReader, serialize
 from gvo.io.bag.recovery.inflate import DamageError
 from gvo.io.bag.recovery.mcap import McapScan
 from gvo.io.bag.recovery.ros1 import Ros1Scan
@@ -153,7 +153,7 @@ def _message_seeds() -> list[bytes]:
 def _metadata(data: bytes) -> None:
     write("folder/metadata.yaml", data)
     write("folder/held_0.mcap", b"")
-    find_files(folder() / "folder")
+    _try(lambda: BagReader(folder() / "folder"))
 
 
 _METADATA = b"""rosbag2_bagfile_information:

@@ -7,7 +7,6 @@ import tempfile
 import weakref
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
 from functools import cache
 from heapq import merge
 from pathlib import Path, PurePath
@@ -151,13 +150,9 @@ class BagReader:
                 yield BagMessage(*message)
 
     def _open_folder(self, folder: Path) -> list[BagFile]:
-        found = find_files(folder)
-        self.notes += found.notes
-        self._missing += found.damage
-        self.is_found |= not found.is_listed
         files: list[BagFile] = []
         refusals: list[RecordingError] = []
-        for path in found.paths:
+        for path in self._find_files(folder):
             try:
                 files.append(self._opened(path))
             except RecordingError as error:
@@ -166,6 +161,35 @@ class BagReader:
             raise refusals[0]
         self._missing += [str(error) for error in refusals]
         return files
+
+    def _find_files(self, folder: Path) -> list[Path]:
+        """Find the files of a bag folder; note those left out, missing, and found without metadata.
+
+        The metadata only name them. All else that they say is in the files too, and not always the
+        same: readers that compare the two find no messages then.
+        """
+        held = sorted(path for path in folder.iterdir() if is_storage(path))
+        has_metadata = (folder / "metadata.yaml").is_file()
+        if not held and not has_metadata:
+            raise RecordingError(f"{folder}: holds neither metadata.yaml nor a .mcap or .db3")
+        names = _listed_files(folder / "metadata.yaml") if has_metadata else []
+        listed = {name: _find(name, held) for name in names}
+        found = [path for path in listed.values() if path is not None]
+        if found:
+            others = [path.name for path in held if path not in found]
+            missing = [folder / name for name, path in listed.items() if path is None]
+            self.notes += [f"bag: {n} is left out: metadata.yaml does not name it" for n in others]
+            self._missing += [f"{path}: is missing; copy it anew" for path in missing]
+            return found
+        if not held:
+            raise RecordingError(
+                f"{folder}: holds no .mcap or .db3, only metadata.yaml; copy it anew"
+            )
+        self.is_found = True
+        state = "names other files" if names else "is malformed" if has_metadata else "is missing"
+        read = ", ".join(path.name for path in held)
+        self.notes.append(f"bag: metadata.yaml {state}: read {read} without it")
+        return held
 
     def _opened(self, path: Path) -> BagFile:
         if path.suffix != _COMPRESSED:
@@ -215,50 +239,6 @@ def serialize(message: object, type_: str, *, is_ros1: bool) -> bytes:
     """Return the bytes of a message of a class of `typestore`, as ROS 1 has them or as CDR."""
     store = typestore(is_ros1=is_ros1)
     return bytes((store.serialize_ros1 if is_ros1 else store.serialize_cdr)(message, type_))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FolderFiles:
-    """What a folder holds; files that end in `.zstd` are compressed."""
-
-    paths: tuple[Path, ...]
-    notes: tuple[str, ...] = ()
-    damage: tuple[str, ...] = ()
-    is_listed: bool = True
-
-
-def find_files(folder: Path) -> FolderFiles:
-    """Find the files of a bag folder.
-
-    The metadata only name them. All else that they say is in the files too, and not always the
-    same: readers that compare the two find no messages then.
-    """
-    held = sorted(path for path in folder.iterdir() if is_storage(path))
-    has_metadata = (folder / "metadata.yaml").is_file()
-    if not held and not has_metadata:
-        raise RecordingError(f"{folder}: holds neither metadata.yaml nor a .mcap or .db3")
-    names = _listed_files(folder / "metadata.yaml") if has_metadata else []
-    listed = {name: _find(name, held) for name in names}
-    found = tuple(path for path in listed.values() if path is not None)
-    if not found:
-        if not held:
-            raise RecordingError(
-                f"{folder}: holds no .mcap or .db3, only metadata.yaml; copy it anew"
-            )
-        state = "names other files" if names else "is malformed" if has_metadata else "is missing"
-        read = ", ".join(path.name for path in held)
-        note = f"bag: metadata.yaml {state}: read {read} without it"
-        return FolderFiles(paths=tuple(held), notes=(note,), is_listed=False)
-    others = [path.name for path in held if path not in found]
-    return FolderFiles(
-        paths=found,
-        notes=tuple(f"bag: {name} is left out: metadata.yaml does not name it" for name in others),
-        damage=tuple(
-            f"{folder / name}: is missing; copy it anew"
-            for name, path in listed.items()
-            if path is None
-        ),
-    )
 
 
 def _find(name: str, held: list[Path]) -> Path | None:
