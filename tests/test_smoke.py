@@ -14,8 +14,6 @@ def test_the_demo_its_comparison_and_its_smoothing(
 ) -> None:
     out = tmp_path / "gvo-demo"
     monkeypatch.setattr("gvo.runs.demo.N_FRAMES", 4)
-    # A test may have loaded what compiles kernels, which says so to all that is started.
-    monkeypatch.delenv("GVO_KERNELS", raising=False)
     monkeypatch.setattr("os.cpu_count", lambda: 1)  # each process that renders makes the world
     assert command("demo", "--out", out).code == 0
     check_place(out, force=True)  # it may be made anew
