@@ -309,6 +309,9 @@ class RelativePose:
     effects : mapping of str to ndarray of float64, shape (6,)
         By how much the pose is moved, in the current camera frame, by a sigma of each constant of
         the camera that is in doubt, by name.
+    shared : ndarray of float64, shape (6, k), optional
+        The same of errors that all registrations of this camera share, in units of their size; they
+        are not in the covariance. None where the front-end does not tell.
     """
 
     T_reference_current: FloatArray
@@ -321,6 +324,7 @@ class RelativePose:
     points_current: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     flow_px: float | None = None
     effects: Mapping[str, FloatArray] = field(default_factory=dict)
+    shared: FloatArray | None = None
 
     @property
     def n_matches(self) -> int:
@@ -350,6 +354,10 @@ class Edge:
         Of (rx, ry, rz, tx, ty, tz), right perturbation, in the new frame.
     kernel : {"none", "huber", "cauchy", "geman_mcclure", "dcs"}, optional
         Robust kernel of this edge; the window's where omitted.
+    effects : ndarray of float64, shape (6, k), optional
+        By how much each of k errors that all edges share moves the new frame, right perturbation:
+        those of a calibration, say, in units of their size. They are beside the covariance: neither
+        more edges nor a longer way make them average out. None: there are none.
 
     Raises
     ------
@@ -361,9 +369,12 @@ class Edge:
     T_reference_frame: FloatArray
     covariance: FloatArray
     kernel: Kernel | None = None
+    effects: FloatArray | None = None
 
     def __post_init__(self) -> None:
         """Copy the arrays."""
+        if self.effects is not None:
+            _freeze(self, effects=(6, np.shape(self.effects)[-1]))
         try:
             hash(self.reference_id)
         except TypeError:

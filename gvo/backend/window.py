@@ -101,6 +101,9 @@ class SlidingWindow:
     variance_factor : float
         By which covariances are multiplied that are given out: what those of all edges turned out
         to be wrong by. Poses and gates do not depend on it.
+    effects_factor : float
+        By which the effects of edges are multiplied, in covariances that are given out: the size of
+        the errors that all edges share.
     misfit : float
         How far the places that the edges of the last pose lead to, from their references as they
         were given out, lie from their mean, in squared sigmas per degree of freedom: about one if
@@ -134,8 +137,10 @@ class SlidingWindow:
         self._clock = StatusClock()
         self._motion = ConstantVelocity()
         self._batch_result: BatchResult | None = None
-        self.variance_factor = 1.0
+        self.variance_factor = self.effects_factor = 1.0
         self.misfit = math.nan
+        # By how much errors that edges share move poses, in their frames, until they are popped.
+        self._effects: dict[FrameId, FloatArray] = {}
 
     def __repr__(self) -> str:
         """Return the number of poses, the newest, and the counts in one line."""
@@ -243,6 +248,7 @@ class SlidingWindow:
         self._graph.keep_causal(estimate)
         self._count(new)
         self.misfit = self._misfit(new)
+        self._consider(frame_id)
         self._update_motion(new, estimate)
         if self._keeps_by_distance and frame_id in self:
             self._keep_by_distance(frame_id)
@@ -339,14 +345,17 @@ class SlidingWindow:
         -------
         Edge
             T_reference_frame, with a covariance from the joint one of both poses: their common
-            uncertainty cancels.
+            uncertainty cancels. What shared errors of the edges make of it is contained.
         """
-        return Edge(
-            reference_id=reference_id,
-            T_reference_frame=se3.invert(self.pose(reference_id)) @ self.pose(frame_id),
-            covariance=self.variance_factor
-            * self._graph.relative_covariance(reference_id, frame_id),
-        )
+        T = se3.invert(self.pose(reference_id)) @ self.pose(frame_id)
+        covariance = self.variance_factor * self._graph.relative_covariance(reference_id, frame_id)
+        start, end = self._effects.get(reference_id), self._effects.get(frame_id)
+        if start is not None or end is not None:
+            # What is not there is exact: the first pose of all.
+            moved = np.zeros((6, 1)) if end is None else end
+            moved = moved - (0.0 if start is None else se3.adjoint(se3.invert(T)) @ start)
+            covariance = covariance + self.effects_factor**2 * moved @ moved.T
+        return Edge(reference_id=reference_id, T_reference_frame=T, covariance=covariance)
 
     def graph(self) -> list[GraphEdge]:
         """Return the measurements of the poses of the window, with residuals and weights.
@@ -375,7 +384,10 @@ class SlidingWindow:
 
     def pop_finished(self) -> list[Estimate]:
         """Return the smoothed estimates of the poses that left since the last call."""
-        return [self._scaled(estimate) for estimate in self._graph.pop_finished()]
+        finished = [self._scaled(estimate) for estimate in self._graph.pop_finished()]
+        for estimate in finished:
+            self._effects.pop(estimate.frame_id, None)
+        return finished
 
     def finish(self) -> list[Estimate]:
         """Return all estimates that were not popped yet, by stamp, and empty the window.
@@ -417,9 +429,48 @@ class SlidingWindow:
         return disagreement(edge, T, covariance, gate=self._config.gate)
 
     def _scaled(self, estimate: Estimate) -> Estimate:
-        if self.variance_factor == 1.0:
-            return estimate
-        return replace(estimate, covariance=self.variance_factor * estimate.covariance)
+        covariance = self.variance_factor * estimate.covariance
+        effects = self._effects.get(estimate.frame_id)
+        if effects is not None:
+            covariance = covariance + self.effects_factor**2 * effects @ effects.T
+        return replace(estimate, covariance=covariance)
+
+    def _consider(self, frame_id: FrameId) -> None:
+        """Find how errors that edges share move a pose: by the mean of where these lead.
+
+        Older poses stay as they are. A prior pins a pose; without measurements it moves as the one
+        before.
+        """
+        if frame_id not in self._poses:
+            return
+        weights, before = np.zeros((6, 6)), self._motion.last
+        total: FloatArray | None = None
+        for measured, _ in self._graph.measurements_of(frame_id):
+            if isinstance(measured, Edge):
+                information = np.linalg.inv(measured.covariance)
+                moved = self._moved_by(measured)
+                if moved is not None:
+                    pull = np.asarray(information @ moved)
+                    total = pull if total is None else total + pull
+            else:
+                information = _pinning(measured, self.pose(frame_id))
+            weights += information
+        if total is not None:
+            self._effects[frame_id] = np.asarray(np.linalg.solve(weights, total))
+        elif not weights.any() and before is not None and before.frame_id in self._effects:
+            T_frame_before = se3.invert(self.pose(frame_id)) @ before.T_world_frame
+            self._effects[frame_id] = se3.adjoint(T_frame_before) @ self._effects[before.frame_id]
+
+    def _moved_by(self, edge: Edge) -> FloatArray | None:
+        """Return how shared errors move where an edge leads; None where it and its start are exact.
+
+        The first pose of all is, and so are edges that do not say.
+        """
+        start = self._effects.get(edge.reference_id)
+        if start is None:
+            return edge.effects
+        moved = np.asarray(se3.adjoint(se3.invert(edge.T_reference_frame)) @ start)
+        return moved if edge.effects is None else moved + edge.effects
 
     def _misfit(self, new: NewPose) -> float:
         """Return how far the edges of a pose disagree, from references as they were given out.
@@ -588,6 +639,7 @@ class SlidingWindow:
                 fault = f"GTSAM gave up on the update: {error}"
             else:
                 self._counted["n_priors" if edge is None else "n_edges"] += 1
+                self._consider(frame_id)
                 return self._scaled(estimate)
         pose = self._poses.get(frame_id)
         rejected = _refusal(frame_id, None if pose is None else pose.stamp_ns, edge, fault)
@@ -617,6 +669,15 @@ class SlidingWindow:
         n_kept = len(scores) + int(self._poses[frame_id].is_kept)
         for kept_id in choose_released(scores, self._config, n_kept=n_kept):
             self.release(kept_id)
+
+
+def _pinning(prior: Prior, T_world_frame: FloatArray) -> FloatArray:
+    """Return the information of a prior, (6, 6), in the frame."""
+    if isinstance(prior, PosePrior):
+        return np.asarray(np.linalg.inv(prior.covariance))
+    information, R = np.zeros((6, 6)), T_world_frame[:3, :3]
+    information[3:, 3:] = R.T @ np.linalg.inv(prior.covariance) @ R
+    return information
 
 
 def _as_edges(frame_id: FrameId, edges: Sequence[Edge]) -> tuple[Edge, ...]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gvo.config import Config
+from gvo.frontend.calibration import CONSIDERED, CalibrationErrors
 from gvo.frontend.carried import CarriedView
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.refinement import Constants
@@ -76,6 +77,8 @@ class ConstantFilter:
         What was learnt.
     covariance : ndarray of float64, shape (k, k)
         Of that.
+    sigmas : ndarray of float64, shape (k,)
+        Those presumed.
     """
 
     def __init__(
@@ -85,7 +88,8 @@ class ConstantFilter:
         self._known: dict[tuple[str, ...], tuple[IntArray, tuple[IntArray, ...]]] = {}
         self.mean, sigmas = np.reshape([*presumed.values()], (-1, 2)).T
         self._prior = self._presumed = np.diag(sigmas**-2)
-        self._prior_vector = self._prior @ self.mean
+        self._prior_vector = self._presumed_vector = self._prior @ self.mean
+        self.sigmas = sigmas
         if rig is not None:
             values, information = rig.of(self.names)
             self._prior = self._presumed + _KEPT * information
@@ -97,6 +101,11 @@ class ConstantFilter:
     def told(self) -> FloatArray:
         """The information of images, shape (k, k), those of earlier runs with their share."""
         return self._prior + self._told - self._presumed
+
+    @property
+    def told_vector(self) -> FloatArray:
+        """That information times the constants, shape (k,)."""
+        return np.asarray(self._prior_vector - self._presumed_vector + self._vector)
 
     @property
     def learnt(self) -> dict[str, tuple[float, float]]:
@@ -230,6 +239,10 @@ class RigOffsets:
         Links of the newest frame, which tell of the camera once the step after it is known.
     carried : CarriedView
         What rides with the camera, and is not used.
+    calibration : CalibrationErrors
+        Errors that all registrations share.
+    learns_lens : bool
+        The lens is learnt, and corrected.
     chain_factor, window_factor : VarianceFactor
         Of the covariances of registrations where they are chained, and where they are smoothed:
         by loops of links and steps, and by the edges of one frame in the window.
@@ -237,9 +250,9 @@ class RigOffsets:
 
     def __init__(self, camera: StereoCamera, config: Config, *, is_stereo: bool = True) -> None:
         self._is_stereo, self._camera, self._rig = is_stereo, camera, camera.rig
-        self._learns_lens = is_stereo and config.stereo.estimate_offset
+        self.learns_lens = is_stereo and config.stereo.estimate_offset
         # What was learnt before is held where nothing is to be learnt.
-        self._held = camera.rig if is_stereo and not self._learns_lens else None
+        self._held = camera.rig if is_stereo and not self.learns_lens else None
         u, v = np.meshgrid(np.linspace(0, camera.width, 17), np.linspace(0, camera.height, 9))
         self._places = np.column_stack([u.ravel(), v.ravel(), np.zeros(u.size)])
         self.carried = CarriedView(camera)
@@ -252,6 +265,14 @@ class RigOffsets:
         presumed = self._presume()
         self._filter = ConstantFilter(presumed, self._rig)
         self.names = tuple(name for name in presumed if name not in ROWS)
+        # What is not learnt to be corrected tells how good the calibration is all the same.
+        self._judged = self._filter
+        if not self.learns_lens:
+            self._judged = ConstantFilter(dict.fromkeys(CONSIDERED[:-1], (0.0, 1.0)))
+            self.names += self._judged.names
+        self.calibration = CalibrationErrors(
+            camera, self._judged.names, in_pixels=not self.learns_lens
+        )
         self._presumed_s = presumed.get(READOUT, (0.0, 0.0))[1]
         # What was significant is so with a share of its information.
         self._gate = _GATE * math.sqrt(1.0 if self._rig is None else _KEPT)
@@ -270,7 +291,7 @@ class RigOffsets:
     def _presume(self) -> dict[str, tuple[float, float]]:
         """Return mean and sigma of all that is to be learnt."""
         presumed = {}
-        if self._learns_lens:
+        if self.learns_lens:
             reach = np.linalg.norm(self._grid, axis=2).max(axis=1)
             for name, reach_px in zip(LENS, reach.tolist(), strict=True):
                 prior_px = _DISPARITY_PRIOR_PX if name[0] == "d" else _LENS_PRIOR_PX
@@ -312,7 +333,7 @@ class RigOffsets:
         self.readout_s = value if is_rolling else 0.0
         is_possible = is_rolling or abs(value) + sigma > _LEAST_READOUT_S
         self.possible_readout_s = math.hypot(self.readout_s, sigma) if is_possible else 0.0
-        if not self._learns_lens:
+        if not self.learns_lens:
             return
         value, sigma = self._filter.one(DELAY)
         self.delay_s = value if abs(value) > max(self._gate * sigma, _LEAST_DELAY_S) else 0.0
@@ -353,6 +374,12 @@ class RigOffsets:
         kernels.write_lens_fields(uvd, self._camera.parameters, fields)
         return fields
 
+    def considered_fields(self, uvd: FloatArray) -> FloatArray:
+        """Return the errors of (u, v, disparity) by a pixel of each of `CONSIDERED`, (9, n, 3)."""
+        fields = np.empty((len(CONSIDERED), len(uvd), 3))
+        kernels.write_considered(uvd, self._camera.parameters, fields)
+        return fields
+
     def _row_fields(self, pixels: FloatArray) -> FloatArray:
         """Return the errors of rows by a unit of each of `ROWS`, shape (6, n)."""
         fields = np.empty((len(ROWS), len(pixels)))
@@ -376,10 +403,14 @@ class RigOffsets:
 
     def note(self, told: Constants) -> None:
         """Take what a link tells of the constants, beside those that are taken off."""
-        used = dict(zip(LENS, self.lens.tolist(), strict=True))
-        used |= {DELAY: self.delay_s, READOUT: self.readout_s}
-        values = np.array([used[name] for name in self.names])
-        self._filter.note(self.names, told.information, told.score, values)
+        used = {DELAY: self.delay_s, READOUT: self.readout_s}
+        used |= zip(LENS, self.lens.tolist(), strict=True)
+        values = np.array([used.get(name, 0.0) for name in self.names])
+        n = sum(name not in ROWS for name in self._filter.names)
+        for each, part in ((self._filter, slice(n)), (self._judged, slice(n, None))):
+            if names := self.names[part]:
+                information, score = told.information[part, part], told.score[part]
+                each.note(names, information, score, values[part])
 
     def note_rows(self, pixels: FloatArray, shifts_px: FloatArray) -> None:
         """Take by how much rows of the right image are larger at pixels (n, 2), as measured.
@@ -387,7 +418,7 @@ class RigOffsets:
         NaN tells nothing. The constants are those of the least robust cost (Cauchy).
         """
         told = np.flatnonzero(np.isfinite(shifts_px))
-        if not self._learns_lens or len(told) < _MIN_ROWS:
+        if not self.learns_lens or len(told) < _MIN_ROWS:
             return
         told = told[:: -(-len(told) // _MAX_ROWS)]
         fields = self._row_fields(pixels[told])
@@ -407,6 +438,9 @@ class RigOffsets:
         self.carried.advance()
         self._filter.advance()
         self._settle()
+        told, vector = self._judged.told, self._judged.told_vector
+        is_corrected = bool(self.lens.any()) and self.learns_lens
+        self.calibration.judge(told, vector, self._judged.sigmas, is_corrected=is_corrected)
 
     def as_json(self) -> dict[str, float]:
         """Return by how much what is seen anywhere is off, as taken off, and the exposure.
@@ -431,6 +465,7 @@ class RigOffsets:
             carried
             | (offsets if self._is_stereo else {})
             | {
+                "calibration_px": round(self.calibration.size_px, 3),
                 "readout_ms": round(1e3 * value, 2),
                 "readout_sigma_ms": round(1e3 * sigma, 2),
             }

@@ -20,6 +20,7 @@ from typing import Protocol
 import numpy as np
 
 from gvo.config import Config
+from gvo.frontend.calibration import CONSIDERED
 from gvo.frontend.offsets import RigOffsets
 from gvo.frontend.registration import check_rows, estimate_roughly, register_correspondences
 from gvo.geometry import se3
@@ -320,6 +321,7 @@ class CalibratedCamera:
         T_correction = se3.exp(measured.frames[0].motion.error())
         # In sigmas of what is known of each constant, as the sensitivities are.
         effects = {name: np.zeros(6) for name in (READOUT, *_VELOCITIES)} | {**result.effects}
+        shared = np.column_stack([effects.pop(name) for name in CONSIDERED])
         by_learnt, by_axis = np.split(np.array([*effects.values()]), [1])
         known = np.eye(len(by_axis))
         told = measured.frames[1].motion.measured
@@ -335,6 +337,7 @@ class CalibratedCamera:
             + by_learnt.T @ by_learnt
             + by_velocity,
             passing_covariance=by_velocity,
+            shared=shared @ self._offsets.calibration.root,
             pixels_reference=measured.uvd[0][:, :2],
             pixels_current=measured.uvd[1][:, :2],
         )
@@ -388,7 +391,7 @@ class CalibratedCamera:
         told = measured.frames[1].motion.measured
         is_adjusted = told is not None and T_start is not None
         corrected = self._corrected(measured)
-        sensitivities, readout_sigma_s = {}, self._offsets.readout[1]
+        sensitivities, readout_sigma_s = self._by_calibration(measured), self._offsets.readout[1]
         if readout_sigma_s > 0.0:
             sensitivities[READOUT] = readout_sigma_s * self._by_exposure(measured)[READOUT]
         sigmas = measured.frames[1].motion.sigmas
@@ -406,6 +409,11 @@ class CalibratedCamera:
             shutter.write_exposure_errors(uvd, lens, velocity, camera, out)
         return dict(zip((READOUT, DELAY), np.swapaxes(errors, 0, 1), strict=True))
 
+    def _by_calibration(self, measured: Measurements) -> dict[str, FloatArray]:
+        """Return the derivatives of measurements by errors of a calibration, by a pixel of each."""
+        both = np.stack([self._offsets.considered_fields(uvd) for uvd in measured.uvd], axis=1)
+        return dict(zip(CONSIDERED, both, strict=True))
+
     def _learn(self, frame: Moving) -> None:
         """Take what the links of a frame tell of the camera, now that the step after it is known.
 
@@ -418,9 +426,11 @@ class CalibratedCamera:
             if measured.frames[1] is not frame:
                 continue
             found = self._by_exposure(measured)
-            if names[0] in LENS:
+            if self._offsets.learns_lens:
                 fields = np.stack([self._offsets.lens_fields(uvd) for uvd in measured.uvd], axis=1)
                 found |= zip(LENS, fields, strict=True)
+            else:
+                found |= self._by_calibration(measured)
             sensitivities = {name: found[name] for name in names}
             prepared = replace(self._corrected(measured), sensitivities=sensitivities)
             T = result.T_reference_current

@@ -31,7 +31,15 @@ def then(first: Edge, second: Edge) -> Edge:
         reference_id=first.reference_id,
         T_reference_frame=first.T_reference_frame @ T,
         covariance=se3.compose_covariance(first.covariance, T, second.covariance),
+        effects=gone_on(first.effects, second),
     )
+
+
+def gone_on(effects: FloatArray | None, edge: Edge) -> FloatArray | None:
+    """Return the effects of shared errors at the end of an edge, by those at its reference."""
+    if effects is None or edge.effects is None:
+        return None
+    return np.asarray(se3.adjoint(se3.invert(edge.T_reference_frame)) @ effects + edge.effects)
 
 
 def inverse(edge: Edge, frame_id: FrameId) -> Edge:
@@ -57,6 +65,7 @@ def inverse(edge: Edge, frame_id: FrameId) -> Edge:
         reference_id=frame_id,
         T_reference_frame=se3.invert(T),
         covariance=0.5 * (covariance + covariance.T),
+        effects=None if edge.effects is None else -se3.adjoint(T) @ edge.effects,
     )
 
 
@@ -74,13 +83,17 @@ def fuse(edges: Sequence[Edge]) -> Edge:
     Edge
         Of the least sum of squares, with the reference and the kernel of the last.
     """
-    T, covariance = edges[0].T_reference_frame, edges[0].covariance
+    T, covariance, effects = edges[0].T_reference_frame, edges[0].covariance, edges[0].effects
     for edge in edges[1:]:
         gain = covariance @ np.linalg.inv(covariance + edge.covariance)
         T = se3.normalize(T @ se3.exp(gain @ se3.log(se3.invert(T) @ edge.T_reference_frame)))
         covariance = gain @ edge.covariance
         covariance = 0.5 * (covariance + covariance.T)
-    return replace(edges[-1], T_reference_frame=T, covariance=covariance)
+        if effects is None or edge.effects is None:
+            effects = None
+        else:
+            effects = effects + gain @ (edge.effects - effects)
+    return replace(edges[-1], T_reference_frame=T, covariance=covariance, effects=effects)
 
 
 def chi2(edge: Edge, T_reference_frame: FloatArray, covariance: FloatArray | None = None) -> float:

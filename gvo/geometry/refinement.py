@@ -218,14 +218,20 @@ def _with_covariance(
     )
     if ended != kernels.DONE:
         return Failure(reason=_REASONS[ended])
-    told = eliminate_pose(T, residuals, inliers) if residuals.constants else None
+    effects = np.empty((len(residuals.constants), 6))
+    ended = kernels.write_effects(
+        *(np.array(T), *residuals.arrays, inliers, residuals.sensitivities),
+        *(residuals.camera.parameters, residuals.huber, effects),
+    )
+    if ended != kernels.DONE:
+        return Failure(reason=_REASONS[ended])
     return Refinement(
         T_reference_current=T,
         covariance=covariance,
         inliers=inliers,
         scale=float(scale[0]),
         residuals=residuals,
-        effects={} if told is None else dict(zip(residuals.constants, told.effects, strict=True)),
+        effects=dict(zip(residuals.constants, effects, strict=True)),
     )
 
 

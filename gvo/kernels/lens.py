@@ -71,6 +71,29 @@ def write_lens_fields(uvd, camera, fields):
             fields[c, k, 0], fields[c, k, 1], fields[c, k, 2] = du, dv, dd
 
 
+@kernel(In("f8", 2), In("f8", 1), Out("f8", 3))
+def write_considered(uvd, camera, fields):
+    """Write the errors of n (u, v, disparity) by a pixel of each constant, fields (9, n, 3).
+
+    An offset of the disparities and its bends x, y, xx, xy, yy; k1 (two pixels), the focal length
+    (three), the baseline (one per cent): at the middle of the left border, or of the upper one.
+    """
+    f, half_width, half_height = camera[0], 0.5 * camera[5] / camera[0], 0.5 * camera[6] / camera[0]
+    for k in range(len(uvd)):
+        x, y, d = (uvd[k, 0] - camera[2]) / f, (uvd[k, 1] - camera[3]) / f, uvd[k, 2] / f
+        along, across, right = x / half_width, y / half_height, x - d
+        for c in range(9):
+            fields[c, k, 0], fields[c, k, 1] = 0.0, 0.0
+        fields[0, k, 2], fields[1, k, 2], fields[2, k, 2] = 1.0, along, across
+        fields[3, k, 2], fields[4, k, 2] = along * along, along * across
+        fields[5, k, 2] = across * across
+        radial = 2.0 * (x * x + y * y) / half_width**3
+        fields[6, k, 0], fields[6, k, 1] = radial * x, radial * y
+        fields[6, k, 2] = radial * x - 2.0 * (right * right + y * y) / half_width**3 * right
+        fields[7, k, 0], fields[7, k, 1] = 3.0 * along, 3.0 * y / half_width
+        fields[7, k, 2], fields[8, k, 2] = 3.0 * d / half_width, 0.01 * uvd[k, 2]
+
+
 @kernel(In("f8", 2), In("f8", 2), In("f8", 1), Out("f8", 2))
 def write_row_errors(pixels, rows, camera, errors):
     """Write by how much rows of the right image are too large at n pixels, by m sets: (m, n)."""

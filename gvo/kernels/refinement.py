@@ -220,6 +220,39 @@ def _add_match(factors, root, rows, r, A, b):
 
 
 @kernel(
+    *(Out("f8", 2), *_MATCHES, In("f8", 4), In("f8", 1), "f8", Out("f8", 2)),
+    returns="i8",
+)
+def write_effects(T, points, uvd, factors, is_used, sensitivities, camera, huber, effects):
+    """Write by how much one unit of each of k constants moves the pose (k, 6); how it ended."""
+    n_constants = len(sensitivities)
+    H, rows, r, J = matrix(6, 6), matrix(6 + n_constants, 3), vector(3), matrix(3, 3)
+    clear(H, vector(6))
+    for c in range(n_constants):
+        for i in range(6):
+            effects[c, i] = 0.0
+    for k in range(len(points)):
+        if not is_used[k]:
+            continue
+        root = _linearize(T, points[k], uvd[k], factors[k], camera, huber, rows, r)
+        if root == 0.0:
+            return BEHIND
+        _write_constants(T, points[k], sensitivities, k, camera, J, rows)
+        for i in range(6):
+            for j in range(i + 1):
+                H[i, j] += dot(rows[i], rows[j])
+        for c in range(n_constants):
+            whiten(factors[k], root, rows[6 + c])
+            for i in range(6):
+                effects[c, i] += dot(rows[6 + c], rows[i])
+    if not factorize(H):
+        return OPEN
+    for c in range(n_constants):
+        substitute(H, effects[c])
+    return DONE
+
+
+@kernel(
     *(Out("f8", 2), *_MATCHES, In("f8", 4), In("f8", 1), "f8"),
     *(Out("f8", 2), Out("f8", 1), Out("f8", 2)),
     returns="i8",

@@ -234,7 +234,12 @@ class RawChain(Generic[ObservationsT]):
         return RawStep(
             estimate=go_on(reference, stamp_ns, T, lasting),
             covariance=se3.compose_covariance(node.covariance, T, variance_factor * lasting),
-            edge=Edge(reference_id=reference.stamp_ns, T_reference_frame=T, covariance=covariance),
+            edge=Edge(
+                reference_id=reference.stamp_ns,
+                T_reference_frame=T,
+                covariance=covariance,
+                effects=result.shared,
+            ),
             registration=result,
             is_steady=self._note_velocity(stamp_ns, result, elapsed_s),
             n_steps=node.n_steps + 1,

@@ -369,6 +369,8 @@ class Odometry:
             for keyframe in self._keyframes.kept.values():
                 keyframe.start = None
         self._window.variance_factor = 1.0
+        if offsets is not None:
+            self._window.effects_factor = offsets.calibration.size_px
         if offsets is not None and not self._is_broken:
             self._window.variance_factor = offsets.window_factor.value
         return step
@@ -432,7 +434,12 @@ class Odometry:
         if isinstance(result, Failure):
             return None
         T, covariance = result.T_reference_current, result.covariance
-        link = Edge(reference_id=stamp_ns, T_reference_frame=T, covariance=covariance)
+        link = Edge(
+            reference_id=stamp_ns,
+            T_reference_frame=T,
+            covariance=covariance,
+            effects=result.shared,
+        )
         if keyframe.start is not None:
             self._note_misclosure(link, keyframe.start, step.estimate)
         return link

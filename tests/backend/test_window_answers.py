@@ -565,3 +565,55 @@ def test_each_pose_is_finished_exactly_once_over_any_changes(
     assert all(
         np.isfinite(e.T_world_frame).all() and np.isfinite(e.covariance).all() for e in finished
     )
+
+
+# What edges share.
+
+G = np.arange(12.0).reshape(6, 2) / 100.0
+
+
+def biased(reference_id: int, T: FloatArray, scale: float = 1.0, sigma: float = 1e-6) -> Edge:
+    return replace(edge(reference_id, T, sigma), effects=scale * G)
+
+
+def test_what_all_edges_share_adds_up_along_a_way_as_it_is() -> None:
+    window, T = SlidingWindow(), np.eye(4)
+    window.effects_factor = 0.1
+    window.add_pose(0, 0, [])
+    expected = np.zeros((6, 2))
+    for k in range(1, 6):
+        given = window.add_pose(k, k * STEP_NS, [biased(k - 1, STEP)])
+        expected = se3.adjoint(se3.invert(STEP)) @ expected + G
+        np.testing.assert_allclose(given.covariance, 0.01 * expected @ expected.T, atol=1e-9)
+    found = window.relative_pose(2, 5).covariance
+    T = window.relative_pose(2, 5).T_reference_frame
+    start = se3.adjoint(se3.invert(STEP)) @ G + G
+    moved = expected - se3.adjoint(se3.invert(T)) @ start
+    np.testing.assert_allclose(found, 0.01 * moved @ moved.T, atol=1e-9)
+    # Without a measurement a pose moves as the one before, and so does one that keeps in step.
+    coasting = window.add_pose(6, 6 * STEP_NS, [])
+    assert coasting.status is Status.COASTING
+    step = window.relative_pose(5, 6)
+    assert np.abs(np.trace(step.covariance)) < 1.0
+
+
+def test_the_mean_of_edges_is_moved_as_their_mean_and_a_prior_pins_it() -> None:
+    window = SlidingWindow()
+    window.add_pose(0, 0, [])
+    edges = [biased(0, STEP, 1.0, 0.01), biased(0, STEP, 4.0, 0.02)]
+    mean = (4.0 * G + 1.0 * 4.0 * G) / 5.0
+    stated = window.add_pose(1, STEP_NS, edges).covariance
+    noise = 1e-4 * 0.8 * np.eye(6)
+    np.testing.assert_allclose(stated, noise + mean @ mean.T, atol=1e-6)
+    sure = PosePrior(T_world_frame=STEP, covariance=1e-12 * np.eye(6))
+    pinned = window.add_prior(1, sure)
+    assert isinstance(pinned, Estimate)
+    assert np.abs(pinned.covariance).max() < 1e-9
+
+
+def test_edges_that_share_nothing_state_what_they_state() -> None:
+    plain, other = SlidingWindow(), SlidingWindow()
+    other.effects_factor = 5.0
+    for window in (plain, other):
+        go_on(window, 0, 5)
+    np.testing.assert_array_equal(plain.covariance(4), other.covariance(4))

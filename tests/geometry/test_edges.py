@@ -1,3 +1,4 @@
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -20,6 +21,7 @@ def edge_of(seed: int, reference_id: object = "a", *, sigma: float = 1e-3) -> Ed
         reference_id=reference_id,
         T_reference_frame=se3.exp(rng.normal(size=6) * [0.5, 0.5, 0.5, 2.0, 2.0, 2.0]),
         covariance=sigma**2 * (root @ root.T + np.eye(6)),
+        effects=rng.normal(size=(6, 2)),
     )
 
 
@@ -131,3 +133,37 @@ def test_an_edge_that_differs_more_has_a_larger_chi2() -> None:
     edge = edge_of(5)
     steps = [chi2(edge, edge.T_reference_frame @ se3.exp(s * np.ones(6))) for s in (0, 0.01, 0.1)]
     assert all(a < b for a, b in pairwise(steps))
+
+
+STEP = 1e-6
+
+
+def bent(edge: Edge, of_one: FloatArray) -> Edge:
+    """Return the edge as shared errors move it; its own effects are gone."""
+    assert edge.effects is not None
+    T = edge.T_reference_frame @ se3.exp(STEP * edge.effects @ of_one)
+    return replace(edge, T_reference_frame=T, effects=None)
+
+
+def assert_moved(found: Edge, exact: Edge, of_one: FloatArray) -> None:
+    assert found.effects is not None
+    twist = se3.log(se3.invert(found.T_reference_frame) @ exact.T_reference_frame)
+    np.testing.assert_allclose(found.effects @ of_one, twist / STEP, rtol=1e-3, atol=1e-3)
+
+
+@given(SEEDS)
+def test_shared_errors_move_what_becomes_of_edges_as_they_move_these(seed: int) -> None:
+    first, second, of_one = edge_of(seed), edge_of(seed + 1, "b"), np.array([0.7, -0.4])
+    both = bent(first, of_one), bent(second, of_one)
+    assert_moved(then(first, second), then(*both), of_one)
+    assert_moved(inverse(first, "b"), inverse(both[0], "b"), of_one)
+    near = first.T_reference_frame @ se3.exp(1e-6 * np.ones(6))
+    other = replace(second, reference_id="a", T_reference_frame=near)
+    assert_moved(fuse([first, other]), fuse([both[0], bent(other, of_one)]), of_one)
+
+
+def test_of_an_edge_that_does_not_tell_its_effects_nothing_is_known() -> None:
+    first, second = edge_of(1), replace(edge_of(2, "b"), effects=None)
+    assert then(first, second).effects is None
+    assert inverse(second, "c").effects is None
+    assert fuse([first, replace(second, reference_id="a")]).effects is None

@@ -67,6 +67,7 @@ def run(kernel: str, matches: Matches) -> int:
         "descend": (PARAMETERS, HUBER, 5),
         "refine": (PARAMETERS, HUBER, 4.0),
         "write_covariance": (PARAMETERS, HUBER, out6, np.empty(1)),
+        "write_effects": (sensitivities, PARAMETERS, HUBER, np.empty((2, 6))),
         "eliminate_pose": (*(sensitivities, PARAMETERS, HUBER, out2, values, np.empty((2, 6))),),
         "adjust": (
             *(sensitivities, PARAMETERS, HUBER, 1.0, 2),
@@ -77,7 +78,7 @@ def run(kernel: str, matches: Matches) -> int:
     return int(ended)
 
 
-KERNELS = ("descend", "refine", "write_covariance", "eliminate_pose", "adjust")
+KERNELS = ("descend", "refine", "write_covariance", "write_effects", "eliminate_pose", "adjust")
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -192,6 +193,10 @@ def test_constants_are_what_no_motion_explains(n_constants: int) -> None:
     assert kernels.eliminate_pose(matches.T.copy(), *matches.arrays, *arguments) == kernels.DONE
     for each, expected in zip(found, (information, score, effects.T), strict=True):
         np.testing.assert_allclose(each, expected, rtol=1e-8)
+    alone = np.empty((n_constants, 6))
+    of_effects = sensitivities, PARAMETERS, HUBER, alone
+    assert kernels.write_effects(matches.T.copy(), *matches.arrays, *of_effects) == kernels.DONE
+    np.testing.assert_array_equal(alone, found[2])
 
 
 def test_a_constant_that_acts_as_a_motion_tells_nothing() -> None:
