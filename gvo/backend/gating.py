@@ -154,6 +154,16 @@ def _near_medoid(distances: FloatArray, is_accepted: BoolArray) -> BoolArray:
     return np.asarray((distances[medoid] <= _AGREEMENT) & is_accepted)
 
 
+def misfit(predictions: Sequence[Prediction]) -> float:
+    """Return how far predictions of a pose lie from their mean, per degree of freedom.
+
+    In squared sigmas; NaN of less than two.
+    """
+    if len(predictions) < 2:
+        return math.nan
+    return _fit(predictions)[1] / (6.0 * (len(predictions) - 1))
+
+
 def _fit(predictions: Sequence[Prediction]) -> tuple[gtsam.Pose3, float, list[FloatArray]]:
     """Return the weighted mean of predictions, their spread, and their twists about the first.
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from gvo.backend.batch import BatchResult
 from gvo.backend.factors import ORIGIN, Measurement, find_faults, prior_fault
-from gvo.backend.gating import Gated, Prediction, disagreement, gate_edges
+from gvo.backend.gating import Gated, Prediction, disagreement, gate_edges, misfit
 from gvo.backend.keyframe_policy import choose_released, is_needed, proximity
 from gvo.backend.motion_model import ConstantVelocity, StatusClock
 from gvo.backend.pose_graph import NewPose, PoseGraph, absence
@@ -477,20 +477,14 @@ class SlidingWindow:
 
         Smoothed since, these have been drawn to where the edges to come lead.
         """
-        total, information, squares, n, T_first = np.zeros(6), np.zeros((6, 6)), 0.0, 0, None
+        predictions = []
         for measurement in new.measurements:
             reference = self._poses.get(measurement.edge.reference_id)
-            if reference is None or reference.causal is None:
-                continue
-            T = reference.causal.T_world_frame @ measurement.edge.T_reference_frame
-            T_first = T if T_first is None else T_first
-            twist, of_one = se3.log(se3.invert(T_first) @ T), measurement.gaussian.information()
-            weighted = of_one @ twist
-            total, information = total + weighted, information + of_one
-            squares, n = squares + float(twist @ weighted), n + 1
-        if n < 2:
-            return math.nan
-        return (squares - float(total @ np.linalg.solve(information, total))) / (6.0 * (n - 1))
+            if reference is not None and reference.causal is not None:
+                T_world_reference = gtsam.Pose3(reference.causal.T_world_frame)
+                T_world_frame = T_world_reference.compose(measurement.T_reference_frame)
+                predictions.append(Prediction(measurement, T_world_frame))
+        return misfit(predictions)
 
     def _count(self, new: NewPose) -> None:
         self._counted["n_poses"] += 1
