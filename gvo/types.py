@@ -515,6 +515,9 @@ class Estimate:
         What ties the pose to the frames before it.
     frame_id : hashable
         The caller's name of the frame.
+    effects : ndarray of float64, shape (6, k), optional
+        By how much each of k errors that all steps of a chain share moves the pose, right
+        perturbation, by one sigma of each; the covariance contains it. None where it is not told.
     rejected : tuple of Rejected
         The edges and the prior that came with the pose and were refused.
     """
@@ -524,11 +527,14 @@ class Estimate:
     covariance: FloatArray
     status: Status = Status.OK
     frame_id: FrameId = field(default=None)
+    effects: FloatArray | None = None
     rejected: tuple[Rejected, ...] = ()
 
     def __post_init__(self) -> None:
         """Copy the arrays."""
         _freeze(self, T_world_frame=(4, 4), covariance=(6, 6))
+        if self.effects is not None:
+            _freeze(self, effects=(6, np.shape(self.effects)[-1]))
 
     def __repr__(self) -> str:
         """Return one line: stamp, position with its standard deviations, status."""
@@ -580,6 +586,8 @@ class Loop:
         Of (rx, ry, rz, tx, ty, tz), right perturbation, in the frame.
     n_matches, n_inliers : int
         Of the registration.
+    effects : ndarray of float64, shape (6, k), optional
+        As of an `Edge`.
     reason : str
         Why it does not count; empty where it does.
     """
@@ -590,6 +598,7 @@ class Loop:
     covariance: FloatArray
     n_matches: int
     n_inliers: int
+    effects: FloatArray | None = None
     reason: str = ""
 
     @property
@@ -599,6 +608,7 @@ class Loop:
             reference_id=self.reference_ns,
             T_reference_frame=self.T_reference_frame,
             covariance=self.covariance,
+            effects=self.effects,
         )
 
 

@@ -322,6 +322,7 @@ class BatchOptimizer:
     def _split(self, graph: WholeGraph, trusted: Set[int]) -> None:
         """Make the factors of the graph; those that may be refused apart from the others."""
         self._kept, self._doubted = gtsam.NonlinearFactorGraph(), list[Link]()
+        self._edges = list[Edge]()  # those that are kept, after the priors
         for key, prior in graph.anchors().items():
             self._kept.add(self._make.prior(key, prior))
         there = set(self.numbers)
@@ -333,6 +334,7 @@ class BatchOptimizer:
             else:
                 measurement = Measurement.of(link.edge)
                 self._kept.add(self._make.between(link.reference, link.frame, measurement))
+                self._edges.append(link.edge)
         self._all = self._factors = self._weighted(np.ones(len(self._doubted)))
 
     def _weighted(self, weights: FloatArray) -> gtsam.NonlinearFactorGraph:
@@ -462,6 +464,53 @@ class BatchOptimizer:
             raise SmoothingError(f"no covariances: {first_line(error)}") from error
         return np.array(found)
 
+    def effects(self) -> FloatArray:
+        """Return how errors that the edges share move the poses, (n, 6, k), by least squares.
+
+        k is 1, and all is zero, where no edge tells of any. None of the edges is doubted.
+
+        Raises
+        ------
+        SmoothingError
+            If a pose is not determined by the edges.
+        """
+        told = [edge.effects for edge in self._edges if edge.effects is not None]
+        if not told:
+            return np.zeros((len(self.numbers), 6, 1))
+        try:
+            J, solve = _solver(self._kept.linearize(self.values))
+        except RuntimeError as error:
+            raise SmoothingError(f"no covariances: {first_line(error)}") from error
+        pulls = np.zeros((J.shape[0], told[0].shape[1]))
+        first = J.shape[0] - 6 * len(self._edges)
+        for row, edge in zip(range(first, J.shape[0], 6), self._edges, strict=True):
+            if edge.effects is not None:
+                root = np.linalg.cholesky(np.linalg.inv(edge.covariance)).T
+                pulls[row : row + 6] = root @ edge.effects
+        return np.asarray(solve(J.T @ pulls)).reshape(len(self.numbers), 6, -1)
+
+
+def _solver(
+    graph: gtsam.GaussianFactorGraph,
+) -> tuple[csc_array, Callable[[FloatArray], FloatArray]]:
+    """Return the Jacobian, by keys in order, and what solves its normal equations.
+
+    Raises
+    ------
+    RuntimeError
+        If the poses are not determined.
+    """
+    rows, columns, values = graph.sparseJacobian_()
+    places = np.array([rows, columns], dtype=int) - 1
+    # Zeros are left out, so the column of the residuals may seem to be missing.
+    shape = places[0].max() + 1, 6 * len(graph.keyVector()) + 1
+    J = csc_array((values, tuple(places)), shape=shape)[:, :-1]
+    solved = splu((J.T @ J).tocsc())
+    pivots = np.abs(solved.U.diagonal())
+    if pivots.min() < _LEAST_PIVOT * pivots.max():
+        raise RuntimeError("a pose is not determined")
+    return J, solved.solve
+
 
 def sparse_marginals(graph: gtsam.GaussianFactorGraph) -> Callable[[int], FloatArray]:
     """Return what computes the marginal covariance of a pose by its key.
@@ -472,20 +521,13 @@ def sparse_marginals(graph: gtsam.GaussianFactorGraph) -> Callable[[int], FloatA
         If the poses are not determined.
     """
     ranks = {key: rank for rank, key in enumerate(sorted(graph.keyVector()))}
-    rows, columns, values = graph.sparseJacobian_()
-    places = np.array([rows, columns], dtype=int) - 1
-    # Zeros are left out, so the column of the residuals may seem to be missing.
-    J = csc_array((values, tuple(places)), shape=(places[0].max() + 1, 6 * len(ranks) + 1))[:, :-1]
-    solved = splu((J.T @ J).tocsc())
-    pivots = np.abs(solved.U.diagonal())
-    if pivots.min() < _LEAST_PIVOT * pivots.max():
-        raise RuntimeError("a pose is not determined")
+    J, solve = _solver(graph)
 
     def marginal(key: int) -> FloatArray:
         block = 6 * ranks[key] + np.arange(6)
         unit = np.zeros((J.shape[1], 6))
         unit[block] = np.eye(6)
-        return np.asarray(solved.solve(unit)[block])
+        return np.asarray(solve(unit)[block])
 
     return marginal
 

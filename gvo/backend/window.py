@@ -22,6 +22,7 @@ from gvo.backend.pose_graph import NewPose, PoseGraph, absence
 from gvo.config import WindowConfig
 from gvo.errors import SmoothingError, write_faults
 from gvo.geometry import se3
+from gvo.geometry.edges import NO_EFFECTS, between, gone_on
 from gvo.trajectory.g2o import g2o_lines
 from gvo.types import (
     Edge,
@@ -349,12 +350,9 @@ class SlidingWindow:
         """
         T = se3.invert(self.pose(reference_id)) @ self.pose(frame_id)
         covariance = self.variance_factor * self._graph.relative_covariance(reference_id, frame_id)
-        start, end = self._effects.get(reference_id), self._effects.get(frame_id)
-        if start is not None or end is not None:
-            # What is not there is exact: the first pose of all.
-            moved = np.zeros((6, 1)) if end is None else end
-            moved = moved - (0.0 if start is None else se3.adjoint(se3.invert(T)) @ start)
-            covariance = covariance + self.effects_factor**2 * moved @ moved.T
+        start, end = (self._effects.get(each, NO_EFFECTS) for each in (reference_id, frame_id))
+        effects = self.effects_factor * between(start, end, T)
+        covariance = covariance + effects @ effects.T
         return Edge(reference_id=reference_id, T_reference_frame=T, covariance=covariance)
 
     def graph(self) -> list[GraphEdge]:
@@ -430,10 +428,8 @@ class SlidingWindow:
 
     def _scaled(self, estimate: Estimate) -> Estimate:
         covariance = self.variance_factor * estimate.covariance
-        effects = self._effects.get(estimate.frame_id)
-        if effects is not None:
-            covariance = covariance + self.effects_factor**2 * effects @ effects.T
-        return replace(estimate, covariance=covariance)
+        effects = self.effects_factor * self._effects.get(estimate.frame_id, NO_EFFECTS)
+        return replace(estimate, covariance=covariance + effects @ effects.T)
 
     def _consider(self, frame_id: FrameId) -> None:
         """Find how errors that edges share move a pose: by the mean of where these lead.
@@ -448,7 +444,7 @@ class SlidingWindow:
         for measured, _ in self._graph.measurements_of(frame_id):
             if isinstance(measured, Edge):
                 information = np.linalg.inv(measured.covariance)
-                moved = self._moved_by(measured)
+                moved = gone_on(self._effects.get(measured.reference_id), measured)
                 if moved is not None:
                     pull = np.asarray(information @ moved)
                     total = pull if total is None else total + pull
@@ -460,17 +456,6 @@ class SlidingWindow:
         elif not weights.any() and before is not None and before.frame_id in self._effects:
             T_frame_before = se3.invert(self.pose(frame_id)) @ before.T_world_frame
             self._effects[frame_id] = se3.adjoint(T_frame_before) @ self._effects[before.frame_id]
-
-    def _moved_by(self, edge: Edge) -> FloatArray | None:
-        """Return how shared errors move where an edge leads; None where it and its start are exact.
-
-        The first pose of all is, and so are edges that do not say.
-        """
-        start = self._effects.get(edge.reference_id)
-        if start is None:
-            return edge.effects
-        moved = np.asarray(se3.adjoint(se3.invert(edge.T_reference_frame)) @ start)
-        return moved if edge.effects is None else moved + edge.effects
 
     def _misfit(self, new: NewPose) -> float:
         """Return how far the edges of a pose disagree, from references as they were given out.

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 
 from gvo.geometry import se3
 from gvo.types import Edge, FloatArray, FrameId
+
+NO_EFFECTS: Final = np.zeros((6, 1))
+"""Of a pose or an edge that shared errors do not move."""
 
 
 def then(first: Edge, second: Edge) -> Edge:
@@ -36,10 +40,19 @@ def then(first: Edge, second: Edge) -> Edge:
 
 
 def gone_on(effects: FloatArray | None, edge: Edge) -> FloatArray | None:
-    """Return the effects of shared errors at the end of an edge, by those at its reference."""
-    if effects is None or edge.effects is None:
-        return None
-    return np.asarray(se3.adjoint(se3.invert(edge.T_reference_frame)) @ effects + edge.effects)
+    """Return the effects of shared errors at the end of an edge, by those at its reference.
+
+    None: there are none, as at the first pose of all, or along an edge that does not say.
+    """
+    if effects is None:
+        return edge.effects
+    moved = np.asarray(se3.adjoint(se3.invert(edge.T_reference_frame)) @ effects)
+    return moved if edge.effects is None else moved + edge.effects
+
+
+def between(start: FloatArray, end: FloatArray, T_start_end: FloatArray) -> FloatArray:
+    """Return the effects of shared errors on relative poses (..., 6, k), by those on both ends."""
+    return np.asarray(end - se3.adjoint(se3.invert(T_start_end)) @ start)
 
 
 def inverse(edge: Edge, frame_id: FrameId) -> Edge:
@@ -89,10 +102,10 @@ def fuse(edges: Sequence[Edge]) -> Edge:
         T = se3.normalize(T @ se3.exp(gain @ se3.log(se3.invert(T) @ edge.T_reference_frame)))
         covariance = gain @ edge.covariance
         covariance = 0.5 * (covariance + covariance.T)
-        if effects is None or edge.effects is None:
-            effects = None
-        else:
-            effects = effects + gain @ (edge.effects - effects)
+        if effects is not None:
+            effects = effects - gain @ effects
+        if edge.effects is not None:
+            effects = (0.0 if effects is None else effects) + gain @ edge.effects
     return replace(edges[-1], T_reference_frame=T, covariance=covariance, effects=effects)
 
 

@@ -21,6 +21,7 @@ from gvo.backend.motion_model import (
 )
 from gvo.frontend.protocol import Frontend, ObservationsT
 from gvo.geometry import se3
+from gvo.geometry.edges import gone_on
 from gvo.types import (
     Contradiction,
     Edge,
@@ -56,6 +57,9 @@ class RawStep:
         Pose of the frame by the chain, with the covariance that registrations state.
     covariance : ndarray of float64, shape (6, 6)
         Of it, by what those turned out to be wrong by.
+    effects : ndarray of float64, shape (6, k), optional
+        By how much each error that all registrations share moves the pose, right perturbation, by
+        one sigma of each as known at the time; not in the covariances.
     edge : Edge or None
         From the frame that the step starts from, named by its stamp; None for the first frame.
     registration : RelativePose or None
@@ -70,11 +74,24 @@ class RawStep:
 
     estimate: Estimate
     covariance: FloatArray
+    effects: FloatArray | None = None
     edge: Edge | None = None
     registration: RelativePose | None = None
     failure: Failure | None = None
     is_steady: bool = False
     n_steps: int = 0
+
+    def stated(self) -> Estimate:
+        """Return the pose, named by its stamp, with the covariance that contains all of it."""
+        covariance, effects = self.covariance, self.effects
+        if effects is not None:
+            covariance = covariance + effects @ effects.T
+        return replace(
+            self.estimate,
+            frame_id=self.estimate.stamp_ns,
+            covariance=covariance,
+            effects=effects,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -83,9 +100,7 @@ class _Node(Generic[ObservationsT]):
 
     frame: Stamped
     observations: ObservationsT
-    estimate: Estimate
-    covariance: FloatArray
-    n_steps: int = 0
+    step: RawStep
 
 
 class RawChain(Generic[ObservationsT]):
@@ -128,6 +143,7 @@ class RawChain(Generic[ObservationsT]):
         current: ObservationsT,
         *,
         variance_factor: float = 1.0,
+        effects_factor: float = 1.0,
         seeks_places: bool = False,
     ) -> RawStep:
         """Register the next frame and return its step.
@@ -139,7 +155,9 @@ class RawChain(Generic[ObservationsT]):
         current : observations
             Of the frame.
         variance_factor : float
-            By which the covariance that the step states is wrong.
+            By which the covariance that the registration states is wrong.
+        effects_factor : float
+            Size of the errors that all registrations share, in units of their `shared`.
         seeks_places : bool
             A camera that was lost looks for places itself: nothing predicts how far it is from the
             last registered frame, and one registration alone may be of a view that looks alike.
@@ -156,24 +174,18 @@ class RawChain(Generic[ObservationsT]):
             step = RawStep(estimate=first, covariance=covariance)
         else:
             self._check_stamp(current.stamp_ns)
-            step, anchors = self._follow(current, variance_factor, seeks_places=seeks_places)
-        newest = _Node(
-            frame=frame,
-            observations=current,
-            estimate=step.estimate,
-            covariance=step.covariance,
-            n_steps=step.n_steps,
-        )
-        self._nodes = [newest, *anchors]
+            factors = variance_factor, effects_factor
+            step, anchors = self._follow(current, factors, seeks_places=seeks_places)
+        self._nodes = [_Node(frame=frame, observations=current, step=step), *anchors]
         return step
 
     def _check_stamp(self, stamp_ns: int) -> None:
-        before_ns = self._nodes[0].estimate.stamp_ns
+        before_ns = self._nodes[0].step.estimate.stamp_ns
         if stamp_ns <= before_ns:
             raise ValueError(f"stamp {stamp_ns} is not after {before_ns}, that of the frame before")
 
     def _follow(
-        self, current: ObservationsT, variance_factor: float, *, seeks_places: bool
+        self, current: ObservationsT, factors: tuple[float, float], *, seeks_places: bool
     ) -> tuple[RawStep, list[_Node[ObservationsT]]]:
         """Return the step of a frame, and the last registered frame if it is not this one."""
         is_lost = seeks_places and self._unregistered_s(current.stamp_ns) > LOST_AFTER_S
@@ -181,14 +193,14 @@ class RawChain(Generic[ObservationsT]):
         for node in self._nodes[: 1 if is_lost else None]:
             result = self._register(node, current)
             if isinstance(result, RelativePose):
-                return self._append(node, current.stamp_ns, result, variance_factor), []
+                return self._append(node, current.stamp_ns, result, *factors), []
             failures.append(result)
         failure = next((each for each in failures if each.reason), failures[-1])
         return self._coast(current.stamp_ns, failure), self._nodes[-1:]
 
     def _unregistered_s(self, stamp_ns: int) -> float:
         """Return the time since the last registered frame."""
-        return 1e-9 * (stamp_ns - self._nodes[-1].estimate.stamp_ns)
+        return 1e-9 * (stamp_ns - self._nodes[-1].step.estimate.stamp_ns)
 
     def _register(
         self, node: _Node[ObservationsT], current: ObservationsT
@@ -196,8 +208,8 @@ class RawChain(Generic[ObservationsT]):
         """Search around the predicted pixels, then around the previous ones."""
         stamp_ns = current.stamp_ns
         if self._velocity is not None and self._unregistered_s(stamp_ns) <= MAX_EXTRAPOLATION_S:
-            newest = self._nodes[0].estimate
-            T_node_newest = se3.invert(node.estimate.T_world_frame) @ newest.T_world_frame
+            newest = self._nodes[0].step.estimate
+            T_node_newest = se3.invert(node.step.estimate.T_world_frame) @ newest.T_world_frame
             # Outliers do not move the median.
             axes = zip(*(velocity.tolist() for _, velocity, _ in self._recent), strict=True)
             recent = np.array([*map(median, axes)])
@@ -215,7 +227,7 @@ class RawChain(Generic[ObservationsT]):
 
     def _predict(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
         """Return the predicted pose of a frame in its predecessor, and its covariance."""
-        newest_ns = self._nodes[0].estimate.stamp_ns
+        newest_ns = self._nodes[0].step.estimate.stamp_ns
         elapsed_s = 1e-9 * (stamp_ns - newest_ns)
         return predict_step(self._velocity, elapsed_s, coasted_s=self._unregistered_s(newest_ns))
 
@@ -225,24 +237,28 @@ class RawChain(Generic[ObservationsT]):
         stamp_ns: int,
         result: RelativePose,
         variance_factor: float,
+        effects_factor: float,
     ) -> RawStep:
-        T, covariance, reference = result.T_reference_current, result.covariance, node.estimate
+        T, covariance, reference = result.T_reference_current, result.covariance, node.step.estimate
         # What the next step takes back is not chained: with it the raw NEES over 1 s of rendered
         # hands with a rolling shutter falls from 0.6 to 0.4, and covariances are too large.
         lasting = covariance - result.passing_covariance
-        elapsed_s = 1e-9 * (stamp_ns - reference.stamp_ns)
+        elapsed_s, before = 1e-9 * (stamp_ns - reference.stamp_ns), node.step
+        shared = None if result.shared is None else effects_factor * result.shared
+        edge = Edge(
+            reference_id=reference.stamp_ns,
+            T_reference_frame=T,
+            covariance=covariance,
+            effects=result.shared,
+        )
         return RawStep(
             estimate=go_on(reference, stamp_ns, T, lasting),
-            covariance=se3.compose_covariance(node.covariance, T, variance_factor * lasting),
-            edge=Edge(
-                reference_id=reference.stamp_ns,
-                T_reference_frame=T,
-                covariance=covariance,
-                effects=result.shared,
-            ),
+            covariance=se3.compose_covariance(before.covariance, T, variance_factor * lasting),
+            effects=gone_on(before.effects, replace(edge, effects=shared)),
+            edge=edge,
             registration=result,
             is_steady=self._note_velocity(stamp_ns, result, elapsed_s),
-            n_steps=node.n_steps + 1,
+            n_steps=before.n_steps + 1,
         )
 
     def _note_velocity(self, stamp_ns: int, result: RelativePose, elapsed_s: float) -> bool:
@@ -259,12 +275,14 @@ class RawChain(Generic[ObservationsT]):
         return bool((change <= limits).all())
 
     def _coast(self, stamp_ns: int, failure: Failure) -> RawStep:
-        before, (T, covariance) = self._nodes[0], self._predict(stamp_ns)
+        before, (T, covariance) = self._nodes[0].step, self._predict(stamp_ns)
         before_ns = before.estimate.stamp_ns
+        edge = Edge(reference_id=before_ns, T_reference_frame=T, covariance=covariance)
         return RawStep(
             estimate=go_on(before.estimate, stamp_ns, T, covariance, Status.COASTING),
             covariance=se3.compose_covariance(before.covariance, T, covariance),
-            edge=Edge(reference_id=before_ns, T_reference_frame=T, covariance=covariance),
+            effects=gone_on(before.effects, edge),
+            edge=edge,
             failure=failure,
             n_steps=before.n_steps + _N_STEPS_COASTED,
         )

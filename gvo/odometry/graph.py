@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from copy import copy
 from dataclasses import replace
@@ -24,7 +24,7 @@ from gvo.backend.factors import ORIGIN
 from gvo.backend.motion_model import SHIFT_SIGMA, TURN_SIGMA
 from gvo.errors import SmoothingError
 from gvo.geometry import se3
-from gvo.geometry.edges import chi2, fuse, inverse, then
+from gvo.geometry.edges import NO_EFFECTS, between, chi2, fuse, inverse, then
 from gvo.odometry.path import Parts, Path, Way, Ways, bent, source_ns
 from gvo.types import Edge, Estimate, FloatArray, Loop, Optimum, PosePrior
 
@@ -86,6 +86,8 @@ class RunGraph:
         self._running: Future[_Verdict] | None = None
         self._n_keyframes = self._next = self._due = 0
         self._is_due = False
+        # Size of the errors that the edges share, in units of their effects.
+        self.effects_factor = 1.0
 
     def __len__(self) -> int:
         """Return the number of frames that were not merged."""
@@ -308,8 +310,12 @@ class RunGraph:
         progress = {"error_before": optimizer.error}
         optimizer.run()
         progress |= {"error": optimizer.error, "n_iterations": optimizer.n_iterations}
-        covariances = self._variance_factor(loops, ways) * optimizer.covariances()
-        return self._place(frames_ns, optimizer.poses(), covariances, ways), progress
+        odometry = BatchOptimizer(self._whole(frames_ns, ()), start="given")
+        drawn = dict(zip(frames_ns, odometry.effects(), strict=True))
+        factor = self._variance_factor(loops, ways, drawn)
+        covariances = factor * optimizer.covariances()
+        effects = self.effects_factor * optimizer.effects()
+        return self._place(frames_ns, optimizer.poses(), covariances, effects, ways), progress
 
     def _reasons(self, loops: Sequence[Loop], ways: Ways) -> dict[tuple[int, int], str]:
         """Return why confirmed loops between two frames do not count."""
@@ -344,21 +350,32 @@ class RunGraph:
                 parts.join(before_ns, frame_ns)
         return graph
 
-    def _variance_factor(self, loops: Sequence[Loop], ways: Ways) -> float:
+    def _variance_factor(
+        self, loops: Sequence[Loop], ways: Ways, effects: Mapping[int, FloatArray]
+    ) -> float:
         """Return how much more odometry drifts than its covariances say, 1 at least.
 
-        The median over the loops of what each contradicts it by, unless that may be chance.
+        The median over the loops of what each contradicts it by, unless that may be chance. What
+        shared errors do to a loop and to the way between its ends, by those on frames, is no drift.
         """
         ratios = []
         for loop in loops:
             if not self._is_across(loop):
                 way = self._way_of(loop, ways)
-                ratios.append(chi2(loop.edge, way.T, way.covariance) / 6.0)
+                moved = between(effects[loop.reference_ns], effects[loop.stamp_ns], way.T)
+                moved -= NO_EFFECTS if loop.effects is None else loop.effects
+                moved *= self.effects_factor
+                ratios.append(chi2(loop.edge, way.T, way.covariance + moved @ moved.T) / 6.0)
         factor = float(np.median(ratios)) if ratios else 1.0
         return factor if factor > INLIER_CHI2 / 6.0 else 1.0
 
     def _place(
-        self, frames_ns: Sequence[int], poses: FloatArray, covariances: FloatArray, ways: Ways
+        self,
+        frames_ns: Sequence[int],
+        poses: FloatArray,
+        covariances: FloatArray,
+        effects: FloatArray,
+        ways: Ways,
     ) -> tuple[Estimate, ...]:
         """Return all frames; those that are not in the graph hang on those that are.
 
@@ -378,7 +395,12 @@ class RunGraph:
         T[others] = bent(placed, ends, poses[after], shares)
         rest = (1.0 - shares)[:, np.newaxis, np.newaxis] * way.covariance
         C[others] = se3.compose_covariance(covariances[before], way.T, rest)
-        return path.estimates(T, C)
+        S = np.empty((n, *effects.shape[1:]))
+        S[known] = effects
+        starts = se3.adjoint(se3.invert(way.T)) @ effects[before]
+        moves = se3.adjoint(se3.invert(T[others]) @ poses[after]) @ effects[after] - starts
+        S[others] = starts + shares[:, np.newaxis, np.newaxis] * moves
+        return path.estimates(T, C + S @ np.swapaxes(S, 1, 2))
 
 
 class _Chain(NamedTuple):

@@ -236,6 +236,7 @@ class LoopDetector:
                         covariance=self.variance_factor * result.covariance,
                         n_matches=result.n_matches,
                         n_inliers=result.n_inliers,
+                        effects=result.shared,
                         reason=_UNCONFIRMED,
                     )
                 )

@@ -291,7 +291,7 @@ class Odometry:
         for estimate in (step.estimate, causal):
             self._poses.extend(estimate.T_world_frame[:3].ravel())
         return FrameResult(
-            raw=replace(step.estimate, frame_id=step.estimate.stamp_ns, covariance=step.covariance),
+            raw=step.stated(),
             causal=causal,
             finished=finished,
             status=causal.status,
@@ -361,6 +361,7 @@ class Odometry:
             frame,
             observations,
             variance_factor=1.0 if offsets is None else offsets.chain_factor.value,
+            effects_factor=1.0 if offsets is None else offsets.calibration.size_px,
             seeks_places=self._map.seeks_places,
         )
         self._map.follow(step)
@@ -370,7 +371,8 @@ class Odometry:
                 keyframe.start = None
         self._window.variance_factor = 1.0
         if offsets is not None:
-            self._window.effects_factor = offsets.calibration.size_px
+            size_px = offsets.calibration.size_px
+            self._window.effects_factor = self._map.graph.effects_factor = size_px
         if offsets is not None and not self._is_broken:
             self._window.variance_factor = offsets.window_factor.value
         return step

@@ -22,7 +22,7 @@ from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.poses.inputs import recorded_truth
 from gvo.io.poses.truth import Truth, TruthComparison, initial_pose
 from gvo.io.recording import OTHER_SIZE, Source
-from gvo.io.run_folder.reader import read_run, trajectory_names
+from gvo.io.run_folder.reader import read_estimates, read_run
 from gvo.io.run_folder.writer import GLOBAL, PICTURE, REPORT, RunFolder, save_summary, written_alone
 from gvo.runs.loop import Output, RunLoop, motions_of_window
 from gvo.runs.outputs.file import FileOutput
@@ -234,8 +234,7 @@ def _measure(
 def _compare(truth: Truth | Failure, folder: RunFolder, loop: RunLoop) -> TruthComparison | Failure:
     if isinstance(truth, Failure):
         return truth
-    names = trajectory_names(folder.path)
-    estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in names}
+    estimates = read_estimates(folder.path)
     try:
         return TruthComparison.of(_within(truth, folder, loop), estimates)
     except GvoError as error:

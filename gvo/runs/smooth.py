@@ -17,12 +17,12 @@ from gvo.errors import GvoError, OutputError, RecordingError, SmoothingError, Tr
 from gvo.io.edges.events import EdgeSource, Event, InputFaults, PoseEvent
 from gvo.io.edges.lines import Request, format_error, format_estimate, parse_line
 from gvo.io.edges.pose_graph import GRAPH, PoseGraphSource, write_graph
+from gvo.io.run_folder.reader import read_estimates
 from gvo.io.run_folder.writer import PICTURE, TRAJECTORIES, RunFolder, written_alone
 from gvo.odometry.chain import EdgeChain
 from gvo.runs.result import RunResult
 from gvo.runs.summary import peak_memory_mb
 from gvo.trajectory.evaluation import Evaluation, evaluate, evaluations_json
-from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Edge, Estimate, FloatArray, FrameId, PositionPrior, Progress, Rejected, Status
 
@@ -244,7 +244,7 @@ def _conclude(
     folder, notes = smoother.folder, smoother.notes
     if smoother.n_poses == 0:
         raise _nothing_to_smooth(notes)
-    estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
+    estimates = read_estimates(folder.path)
     summary = {**_summary(smoother), "configuration": smoother.config.model_dump()}
     notes.warnings = [*_warnings(smoother), *notes.warnings]
     return _written(folder, summary, estimates, truth, notes, on_written)

@@ -358,14 +358,13 @@ class Motions:
             Indices.
         name : str
         """
-        T, stamps_ns = chain.T_world_frame, chain.stamps_ns
-        C = np.zeros((len(chain), 6, 6)) if chain.covariances is None else chain.covariances
-        T_start_end = se3.invert(T[first]) @ T[last]
-        covariances = C[last] - se3.transport_covariance(C[first], se3.invert(T_start_end))
+        if chain.covariances is None:
+            chain = replace(chain, covariances=np.zeros((len(chain), 6, 6)))
+        T_start_end, covariances = chain.motions(first, last)
         return cls(
             name=name,
-            start_ns=stamps_ns[first],
-            end_ns=stamps_ns[last],
+            start_ns=chain.stamps_ns[first],
+            end_ns=chain.stamps_ns[last],
             T_start_end=T_start_end,
             covariances=covariances,
         )

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 from gvo._text import format_stamp as format_stamp
 from gvo._text import plain_number, shortened
 from gvo.geometry import se3
-from gvo.types import Estimate, FloatArray, IntArray
+from gvo.geometry.edges import between
+from gvo.types import Edge, Estimate, FloatArray, IntArray
 
 StampsFrom = Literal["file", "times", "rows", "topic"]
 PoseLayout = Literal["tum", "kitti", "euroc"]
@@ -38,6 +39,9 @@ class Trajectory:
         Map coordinates of the frame (of the camera, a robot's) to the world, metres.
     covariances : ndarray of float64, shape (n, 6, 6), optional
         Of (rx, ry, rz, tx, ty, tz), right perturbation, in that frame.
+    effects : ndarray of float64, shape (n, 6, k), optional
+        By how much each of k errors that all steps of a chain share moves the poses, right
+        perturbations, by one sigma of each; the covariances contain it. See `motion`.
     stamps_from : {"file", "times", "rows", "topic"}
         Origin of the stamps: a column of the file; a separate list of stamps; row numbers, one
         second each; message headers, with the rate and phase of another device.
@@ -57,6 +61,7 @@ class Trajectory:
     stamps_ns: IntArray
     T_world_frame: FloatArray
     covariances: FloatArray | None = None
+    effects: FloatArray | None = None
     stamps_from: StampsFrom = "file"
     has_rotations: bool = True
     n_repeated: int = 0
@@ -74,6 +79,9 @@ class Trajectory:
         if self.covariances is not None:
             covariances = _checked_array("covariances", self.covariances, (n, 6, 6))
             object.__setattr__(self, "covariances", covariances)
+        if self.effects is not None:
+            effects = _checked_array("effects", self.effects, (n, 6, np.shape(self.effects)[-1]))
+            object.__setattr__(self, "effects", effects)
         if self.has_rotations:
             return
         if self.covariances is not None or not np.all(poses[:, :3, :3] == np.eye(3)):
@@ -81,12 +89,22 @@ class Trajectory:
 
     @classmethod
     def of(cls, estimates: Iterable[Estimate]) -> Trajectory:
-        """Collect estimates of different stamps, in any order, with their covariances."""
+        """Collect estimates of different stamps, in any order, with their covariances.
+
+        Where some have effects of shared errors, poses without, such as the first, have zeros.
+        """
         ordered = sorted(estimates, key=lambda estimate: estimate.stamp_ns)
+        effects: FloatArray | None = None
+        for row, estimate in enumerate(ordered):
+            if estimate.effects is not None:
+                if effects is None:
+                    effects = np.zeros((len(ordered), *estimate.effects.shape))
+                effects[row] = estimate.effects
         return cls(
             stamps_ns=np.array([estimate.stamp_ns for estimate in ordered], dtype=np.int64),
             T_world_frame=np.array([e.T_world_frame for e in ordered]).reshape(-1, 4, 4),
             covariances=np.array([e.covariance for e in ordered]).reshape(-1, 6, 6),
+            effects=effects,
         )
 
     @classmethod
@@ -157,12 +175,13 @@ class Trajectory:
         chosen = indices if isinstance(indices, slice) else np.asarray(indices)
         if not isinstance(chosen, slice) and chosen.size == 0:
             chosen = np.empty(0, dtype=np.int64)  # an empty list would be an array of floats
-        covariances = self.covariances
+        covariances, effects = self.covariances, self.effects
         return replace(
             self,
             stamps_ns=self.stamps_ns[chosen],
             T_world_frame=self.T_world_frame[chosen],
             covariances=None if covariances is None else covariances[chosen],
+            effects=None if effects is None else effects[chosen],
         )
 
     def transformed(self, T_frame_other: FloatArray) -> Trajectory:
@@ -188,13 +207,59 @@ class Trajectory:
             if np.any(T_frame_other[:3, 3] != 0.0):
                 raise ValueError("without rotations the positions of another point are not known")
             return self
-        covariances = self.covariances
+        covariances, effects = self.covariances, self.effects
+        # T exp(xi) B = T B exp(Ad(B^-1) xi)
+        T_other_frame = se3.invert(T_frame_other)
         if covariances is not None:
-            # T exp(xi) B = T B exp(Ad(B^-1) xi)
-            covariances = se3.transport_covariance(covariances, se3.invert(T_frame_other))
+            covariances = se3.transport_covariance(covariances, T_other_frame)
         return replace(
-            self, T_world_frame=self.T_world_frame @ T_frame_other, covariances=covariances
+            self,
+            T_world_frame=self.T_world_frame @ T_frame_other,
+            covariances=covariances,
+            effects=None if effects is None else se3.adjoint(T_other_frame) @ effects,
         )
+
+    def motion(self, first: int, last: int) -> Edge:
+        """Return the pose of one frame in an earlier one, of a chain with covariances.
+
+        Parameters
+        ----------
+        first, last : int
+            Indices of poses, each of which is the one before moved by an independent measurement:
+            those that `gvo run` calls raw.
+
+        Returns
+        -------
+        Edge
+            With the stamp of the first pose as its reference. The covariances of both poses do not
+            tell that of the motion where errors are shared: these add up along the way, and only
+            what they did before it is common to both.
+
+        Raises
+        ------
+        ValueError
+            If there are no covariances.
+        """
+        T, covariances = self.motions(np.array([first]), np.array([last]))
+        return Edge(
+            reference_id=int(self.stamps_ns[first]),
+            T_reference_frame=T[0],
+            covariance=covariances[0],
+        )
+
+    def motions(self, first: IntArray, last: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return many motions as `motion` does: (m, 4, 4), with covariances, (m, 6, 6)."""
+        if self.covariances is None:
+            raise ValueError("without covariances of the poses those of motions are not known")
+        noise, effects = self.covariances, self.effects
+        if effects is not None:
+            noise = noise - effects @ np.swapaxes(effects, 1, 2)
+        T = se3.invert(self.T_world_frame[first]) @ self.T_world_frame[last]
+        covariances = noise[last] - se3.transport_covariance(noise[first], se3.invert(T))
+        if effects is not None:
+            moved = between(effects[first], effects[last], T)
+            covariances = covariances + moved @ np.swapaxes(moved, 1, 2)
+        return T, covariances
 
     def moved(self, T_map_world: FloatArray) -> Trajectory:
         """Return the trajectory in another world frame.
@@ -256,7 +321,7 @@ class Trajectory:
         """
         wanted = _checked_stamps(stamps_ns)
         if len(self) == 0 or len(wanted) == 0:
-            return replace(self.select([]), covariances=None)
+            return replace(self.select([]), covariances=None, effects=None)
         wanted = wanted[(wanted >= self.stamps_ns[0]) & (wanted <= self.stamps_ns[-1])]
         after = np.searchsorted(self.stamps_ns, wanted)
         before = np.maximum(after - 1, 0)
@@ -268,7 +333,7 @@ class Trajectory:
         spans = np.maximum(self.stamps_ns[after] - self.stamps_ns[before], 1)
         shares = ((wanted - self.stamps_ns[before]) / spans)[:, np.newaxis]
         poses = _between(self.T_world_frame[before], self.T_world_frame[after], shares)
-        return replace(self, stamps_ns=wanted, T_world_frame=poses, covariances=None)
+        return replace(self, stamps_ns=wanted, T_world_frame=poses, covariances=None, effects=None)
 
 
 def _checked_stamps(stamps_ns: IntArray) -> IntArray:

@@ -162,8 +162,15 @@ def test_shared_errors_move_what_becomes_of_edges_as_they_move_these(seed: int) 
     assert_moved(fuse([first, other]), fuse([both[0], bent(other, of_one)]), of_one)
 
 
-def test_of_an_edge_that_does_not_tell_its_effects_nothing_is_known() -> None:
-    first, second = edge_of(1), replace(edge_of(2, "b"), effects=None)
-    assert then(first, second).effects is None
-    assert inverse(second, "c").effects is None
-    assert fuse([first, replace(second, reference_id="a")]).effects is None
+@given(SEEDS)
+def test_an_edge_without_effects_is_not_moved(seed: int) -> None:
+    first, second, of_one = edge_of(seed), edge_of(seed + 1, "b"), np.array([0.7, -0.4])
+    still = replace(second, effects=None)
+    assert_moved(then(first, still), then(bent(first, of_one), still), of_one)
+    assert_moved(then(still, first), then(still, bent(first, of_one)), of_one)
+    near = first.T_reference_frame @ se3.exp(1e-6 * np.ones(6))
+    other = replace(second, reference_id="a", T_reference_frame=near, effects=None)
+    assert_moved(fuse([first, other]), fuse([bent(first, of_one), other]), of_one)
+    assert_moved(fuse([other, first]), fuse([other, bent(first, of_one)]), of_one)
+    for edge in (then(still, still), inverse(still, "c"), fuse([still, still])):
+        assert edge.effects is None

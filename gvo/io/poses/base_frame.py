@@ -165,6 +165,7 @@ class BaseFrame:
             estimate,
             T_world_frame=T_camera @ se3.invert(T_base_cam),
             covariance=0.5 * (covariance + covariance.T),  # symmetric in spite of rounding
+            effects=_transported(estimate.effects, T_base_cam),
         )
 
     def apply_to_step(self, start_ns: int, stamp_ns: int, T_start_end: FloatArray) -> FloatArray:
@@ -188,12 +189,18 @@ class BaseFrame:
             edge,
             T_reference_frame=self.apply_to_step(start_ns, stamp_ns, edge.T_reference_frame),
             covariance=se3.transport_covariance(edge.covariance, self.T_base_cam(stamp_ns)),
+            effects=_transported(edge.effects, self.T_base_cam(stamp_ns)),
         )
 
     def apply_to_loop(self, loop: Loop) -> Loop:
         """Return a loop as one of the base frame."""
         edge = self.apply_to_edge(loop.stamp_ns, loop.edge)
-        return replace(loop, T_reference_frame=edge.T_reference_frame, covariance=edge.covariance)
+        return replace(
+            loop,
+            T_reference_frame=edge.T_reference_frame,
+            covariance=edge.covariance,
+            effects=edge.effects,
+        )
 
     def convert(self, trajectory: Trajectory) -> Trajectory:
         """Convert true poses of the camera, in any world, into those of the base frame.
@@ -222,6 +229,10 @@ class BaseFrame:
         is_known = np.array([not is_guessed for _, is_guessed in found], dtype=np.bool_)
         T_base_cam = np.array([T for T, _ in found]).reshape(-1, 4, 4)
         return moved(trajectory, se3.invert(T_base_cam), is_known)
+
+
+def _transported(effects: FloatArray | None, T_base_cam: FloatArray) -> FloatArray | None:
+    return None if effects is None else np.asarray(se3.adjoint(T_base_cam) @ effects)
 
 
 def find_base_frame(

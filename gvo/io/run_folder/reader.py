@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 from gvo._text import read_text, text_lines
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
-from gvo.io.run_folder.writer import GLOBAL, POSITIONS_HEADER, TRAJECTORIES, TRUE_POSITIONS, TRUTH
+from gvo.io.run_folder.writer import (
+    EFFECTS,
+    GLOBAL,
+    POSITIONS_HEADER,
+    TRAJECTORIES,
+    TRUE_POSITIONS,
+    TRUTH,
+)
 from gvo.trajectory.evaluation import SMOOTHED_GLOBAL
 from gvo.trajectory.formats import MAX_LINES, MAX_POSITION_M, read_trajectory
 from gvo.trajectory.trajectory import StampsFrom, Trajectory
@@ -149,10 +156,6 @@ def read_run(folder: str | Path) -> RunRecord:
         raise RecordingError(f"{folder}: is not a run folder: {missing[0]} is missing; {_EXPECTED}")
     summary = _read_summary(folder / "summary.json")
     tables = {name: _read_table(folder / f"{name}.csv", _REQUIRED[name]) for name in _REQUIRED}
-    trajectories = {
-        name: read_trajectory(folder / f"{name}.txt", is_growing=True)
-        for name in trajectory_names(folder)
-    }
     return RunRecord(
         folder=folder,
         summary=summary,
@@ -160,14 +163,28 @@ def read_run(folder: str | Path) -> RunRecord:
         edges=tables["edges"],
         timings=tables["timings"],
         loops=tables["loops"],
-        trajectories=trajectories,
+        trajectories=read_estimates(folder, is_growing=True),
         truth=_read_truth(folder, summary),
     )
 
 
-def trajectory_names(folder: Path) -> list[str]:
-    """Return the names of the trajectories of a run: the global one where there is one."""
-    return [*TRAJECTORIES, *([GLOBAL] if (folder / f"{GLOBAL}.txt").is_file() else [])]
+def read_estimates(folder: Path, *, is_growing: bool = False) -> dict[str, Trajectory]:
+    """Read the trajectories of a run, the global one where there is one, as `read_trajectory` does.
+
+    The raw one comes with the effects of shared errors, if the run knew any.
+    """
+    names = [*TRAJECTORIES, *([GLOBAL] if (folder / f"{GLOBAL}.txt").is_file() else [])]
+    found = {name: read_trajectory(folder / f"{name}.txt", is_growing=is_growing) for name in names}
+    path, raw = folder / EFFECTS, found["raw"]
+    if not path.is_file() or raw.covariances is None:
+        return found
+    try:
+        effects = np.load(path, allow_pickle=False)
+        n = min(len(effects), len(raw)) if is_growing else len(raw)  # one may be a pose ahead
+        found["raw"] = replace(raw.select(slice(n)), effects=effects[:n])
+    except (OSError, ValueError, TypeError, EOFError) as error:
+        raise TrajectoryError(f"{path}: is damaged: {error}; run again") from error
+    return found
 
 
 def _read_summary(path: Path) -> dict[str, Any]:

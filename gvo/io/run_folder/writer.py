@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
@@ -27,7 +28,7 @@ from gvo.trajectory.formats import (
 )
 from gvo.trajectory.g2o import format_edge, format_vertex
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Estimate, FaultyFrame, FrameResult, IntArray, Optimum, Status
+from gvo.types import Estimate, FaultyFrame, FloatArray, FrameResult, IntArray, Optimum, Status
 
 SUMMARY = "summary.json"
 RIG = "rig.yaml"
@@ -41,6 +42,8 @@ TRAJECTORIES = ("raw", "causal", "smoothed")
 """Those that are written as the run goes."""
 GLOBAL = "global"
 """The one that comes at its end."""
+EFFECTS = "effects.npy"
+"""How errors that all steps share move the raw poses, shape (n, 6, k): a file of numpy."""
 GRAPH = "graph.g2o"
 LOOPS = "loops.csv"
 LOOPS_HEADER = (
@@ -61,7 +64,7 @@ _RIG_HEADER = "# What was learnt of this camera: `gvo run RECORDING --rig FILE` 
 
 _RESULTS = (
     *(SUMMARY, RIG, "edges.csv", "timings.csv", PICTURE, REPORT),
-    *(TRUTH, TRUE_POSITIONS, GRAPH, LOOPS, f"{GLOBAL}.txt"),
+    *(TRUTH, TRUE_POSITIONS, EFFECTS, GRAPH, LOOPS, f"{GLOBAL}.txt"),
     "frames.csv",
     *(f"{name}.txt" for name in TRAJECTORIES),
     "explanation.html",
@@ -178,6 +181,7 @@ class RunFolder(AbstractContextManager["RunFolder"]):
         self.path = path
         self._is_writable = True
         self._files: dict[str, io.FileIO] = {}
+        self._n_raw = 0
         with ExitStack() as stack, self._refused_on_error(path):
             path.mkdir(parents=True, exist_ok=True)
             covariances = (f"{name}_covariance.csv" for name in (*TRAJECTORIES, GLOBAL))
@@ -230,6 +234,7 @@ class RunFolder(AbstractContextManager["RunFolder"]):
     def add_poses(self, raw: Estimate, causal: Estimate, row: Sequence[object]) -> None:
         """Write both poses of a frame as it arrives, and its row of the table."""
         self._add_pose("raw", raw)
+        self._add_effects(raw.effects)
         self._add_pose("causal", causal)
         self._write("frames.csv", _csv_line(row))
 
@@ -273,6 +278,22 @@ class RunFolder(AbstractContextManager["RunFolder"]):
         self._write(f"{name}.txt", f"{pose}\n")
         covariance = format_covariance_line(estimate.stamp_ns, estimate.covariance)
         self._write(f"{name}_covariance.csv", f"{covariance}\n")
+
+    def _add_effects(self, effects: FloatArray | None) -> None:
+        """Write how shared errors move a raw pose; the file begins with the first that tells."""
+        self._n_raw += 1
+        if effects is None and EFFECTS not in self._files:
+            return
+        with self._refused_on_error(self.path / EFFECTS):
+            if effects is not None and EFFECTS not in self._files:
+                shape = (self._n_raw - 1, *effects.shape)
+                self._open(EFFECTS, "")
+                append_whole(self._files[EFFECTS], _npy_header(shape) + bytes(8 * math.prod(shape)))
+                self._effects_shape = effects.shape
+            row = np.zeros(self._effects_shape) if effects is None else effects
+            append_whole(self._files[EFFECTS], row.tobytes())
+            self._files[EFFECTS].seek(0)
+            self._files[EFFECTS].write(_npy_header((self._n_raw, *self._effects_shape)))
 
     def frame_stamps_ns(self) -> IntArray:
         """Return the stamps of all frames of the table, shape (n,), also of faulty ones."""
@@ -326,6 +347,14 @@ class RunFolder(AbstractContextManager["RunFolder"]):
     def _close_files(self) -> None:
         for file in self._files.values():
             file.close()
+
+
+def _npy_header(shape: tuple[int, ...]) -> bytes:
+    """Return the header of a numpy file of numbers; for any count of rows it is as long."""
+    header = io.BytesIO()
+    array = {"descr": "<f8", "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(header, array)
+    return header.getvalue()
 
 
 def save_summary(folder: Path, summary: dict[str, Any]) -> None:

@@ -55,6 +55,7 @@ from rosbags.rosbag2 import WriterError as WriterError2
 from gvo.errors import RecordingError
 from gvo.frontend.klt import image_of
 from gvo.geometry import se3
+from gvo.geometry.edges import NO_EFFECTS, between
 from gvo.io.bag.reader import TF_TYPE
 from gvo.io.bag.topics import COMPRESSED_TYPE
 from gvo.io.convert.bag_messages import (
@@ -206,10 +207,14 @@ class RunMessages:
         """
         last = self._last
         is_step = last is not None and last.status == pose.status == Status.OK
-        if not is_step or result.registration is None:
+        if last is None or not is_step or result.registration is None:
             return None
         mount = self._frames.mount(pose.stamp_ns)
-        return se3.transport_covariance(result.registration.covariance, mount)
+        covariance = se3.transport_covariance(result.registration.covariance, mount)
+        start, end = (NO_EFFECTS if e.effects is None else e.effects for e in (last, result.raw))
+        T = se3.invert(last.T_world_frame) @ result.raw.T_world_frame
+        effects = between(start, end, T)
+        return np.asarray(covariance + effects @ effects.T)
 
     def _write_odometry(
         self, name: str, estimate: Estimate, step_covariance: FloatArray | None = None
