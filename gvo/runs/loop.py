@@ -20,13 +20,11 @@ from gvo.io.recording import Source
 from gvo.odometry.odometry import Odometry
 from gvo.runs.outputs.file import FileOutput
 from gvo.runs.statistics import RunStatistics
-from gvo.trajectory.evaluation import Motions
+from gvo.trajectory.consistency import SPANS_S, Motions
 from gvo.types import Edge, Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Optimum, Progress
 
 _LOGGER = logging.getLogger(__name__)
 
-# Once per span the window gives the motion over it, to compare covariances with the truth.
-_SPAN_NS = 1_000_000_000
 _MOST_OFF_NS = 500_000_000
 
 
@@ -69,9 +67,9 @@ class RunLoop:
         Which frames are read.
     statistics : RunStatistics
         Counts so far.
-    edges : list of (int, Edge)
-        Motions of the base frame over about 1 s as the window had them, about one a second: the
-        stamp of a frame, and the edge to it from a frame about 1 s earlier.
+    edges : dict of int to list of (int, Edge)
+        Motions of the base frame as the window had them, by their span in seconds, one per span:
+        the stamp of a frame, and the edge to it from a frame about so much earlier.
     output_faults : list of str
         Why outputs could not be written completely.
     waited_s : callable
@@ -99,11 +97,11 @@ class RunLoop:
         self._first_ns: int | None = None
         self._previous_ns: int | None = None
         self._outputs: list[Output] = []
-        self.edges: list[tuple[int, Edge]] = []
+        self.edges: dict[int, list[tuple[int, Edge]]] = {span_s: [] for span_s in SPANS_S}
+        self._asked_ns = dict[int, int]()
         self.output_faults: list[str] = []
         self.waited_s: Callable[[], float] = lambda: 0.0
         self.on_tracked: Callable[[Frame | FaultyFrame, FrameResult | None], None] | None = None
-        self._asked_ns: int | None = None
         self._odometry = Odometry(source.info.camera, config)
 
     @property
@@ -264,15 +262,15 @@ class RunLoop:
                     output.discard()
 
     def _ask_window(self, stamp_ns: int) -> None:
-        """Once a second, keep the motion over the last second as the window has it."""
-        if self._asked_ns is None:
-            self._asked_ns = stamp_ns
-        if stamp_ns - self._asked_ns < _SPAN_NS:
-            return
-        self._asked_ns = stamp_ns
-        edge = edge_over(self._odometry.window, stamp_ns, _SPAN_NS)
-        if edge is not None:
-            self.edges.append((stamp_ns, self.base_frame.apply_to_edge(stamp_ns, edge)))
+        """Once per span, keep the motion over it as the window has it."""
+        for span_s, edges in self.edges.items():
+            span_ns = span_s * 10**9
+            if stamp_ns - self._asked_ns.setdefault(span_s, stamp_ns) < span_ns:
+                continue
+            self._asked_ns[span_s] = stamp_ns
+            edge = edge_over(self._odometry.window, stamp_ns, span_ns)
+            if edge is not None:
+                edges.append((stamp_ns, self.base_frame.apply_to_edge(stamp_ns, edge)))
 
     def _take_faulty(self, item: FaultyFrame) -> None:
         is_loss = is_lost(item, self.source.info.sensor)
@@ -337,7 +335,7 @@ def motions_of_window(edges: Sequence[tuple[int, Edge]], *, name: str) -> Motion
     Parameters
     ----------
     edges : sequence of (int, Edge)
-        Stamps and edges, as `RunLoop.edges`.
+        Stamps and edges, as `RunLoop.edges` of one span.
     name : str
     """
     return Motions(

@@ -30,7 +30,8 @@ from gvo.runs.outputs.options import RunOutputs
 from gvo.runs.result import RunResult
 from gvo.runs.summary import RunningSummary, optimum_json, run_identity, summarize
 from gvo.trajectory.alignment import MAX_DIFFERENCE_NS
-from gvo.trajectory.evaluation import Consistency, Evaluation, consistency, motions_of_chain
+from gvo.trajectory.consistency import judged
+from gvo.trajectory.evaluation import Evaluation
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, Optimum, Progress
@@ -217,18 +218,30 @@ def _measure(
     folder: RunFolder, loop: RunLoop, compared: TruthComparison | Failure
 ) -> dict[str, Any]:
     """Return path length, extent, and how the covariances fit the truth, if there is one."""
-    positions = read_trajectory(folder.path / "smoothed.txt")
-    found: list[Consistency | None] = []
-    if isinstance(compared, TruthComparison):
-        window = motions_of_window(loop.edges, name="window over 1 s")
-        motions = [window, *motions_of_chain(compared.estimates["raw"])]
-        found = [consistency(compared.truth.trajectory, each) for each in motions]
-    return {
-        "path_m": float(positions.distances()[-1]),
-        "extent_m": float(np.linalg.norm(np.ptp(positions.positions, axis=0))),
-        "truth_jump_m": compared.truth_jump_m if isinstance(compared, TruthComparison) else None,
-        "covariances": [each.as_json() for each in found if each is not None],
+    smoothed = read_trajectory(folder.path / "smoothed.txt")
+    found = {
+        "path_m": float(smoothed.distances()[-1]),
+        "extent_m": float(np.linalg.norm(np.ptp(smoothed.positions, axis=0))),
+        "heading_deg": _heading_deg(smoothed, loop.base_frame),
     }
+    if not isinstance(compared, TruthComparison):
+        return found | {"truth_jump_m": None, "nees": {}, "reference": None}
+    window = {
+        span_s: motions_of_window(edges, name=f"window over {span_s} s")
+        for span_s, edges in loop.edges.items()
+    }
+    found |= judged(compared.truth.trajectory, compared.estimates["raw"], window)
+    return found | {"truth_jump_m": compared.truth_jump_m}
+
+
+def _heading_deg(trajectory: Trajectory, base_frame: BaseFrame) -> float | None:
+    """Return the angle between the way and the optical axis, forward or back, in the mean."""
+    if base_frame.first_stamp_ns is None or not (path_m := trajectory.distances()[-1]):
+        return None
+    axis = base_frame.T_base_cam(base_frame.first_stamp_ns)[:3, 2]
+    axes = trajectory.T_world_frame[:-1, :3, :3] @ axis
+    ahead_m = np.abs(np.sum(axes * np.diff(trajectory.positions, axis=0), axis=1)).sum()
+    return float(np.rad2deg(np.arccos(min(ahead_m / path_m, 1.0))))
 
 
 def _compare(truth: Truth | Failure, folder: RunFolder, loop: RunLoop) -> TruthComparison | Failure:

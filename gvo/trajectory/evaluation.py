@@ -1,4 +1,4 @@
-"""Errors of a trajectory against a reference: ATE, RPE, segments, covariances, and their table."""
+"""Errors of a trajectory against a reference: ATE, RPE, segments, and their table."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.special import gammaincinv
 
 from gvo._text import MAX_WIDTH, format_table, number_text
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
-from gvo.trajectory.alignment import MAX_DIFFERENCE_NS, MAX_GAP_NS, AlignMode, alignment, pair
+from gvo.trajectory.alignment import MAX_DIFFERENCE_NS, AlignMode, alignment, pair
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import BoolArray, FloatArray, IntArray
+from gvo.types import FloatArray, IntArray
 
 KITTI_SEGMENTS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 """Segment lengths of the KITTI odometry benchmark, metres."""
@@ -26,8 +25,6 @@ SHORT_SEGMENTS_M = (20.0, 50.0)
 """Their lengths, metres."""
 SHORT_STEP = 1
 """Poses between the starts of segments of those paths."""
-N_DOF = 6
-"""Degrees of freedom of a pose and of an edge."""
 
 _MIN_PATH_M = 1e-6
 # A step stands out where its error is so many times that of three in four.
@@ -238,21 +235,13 @@ def segment_errors(
         raise ValueError(f"step and lengths must be positive, got {step} and {lengths_m}")
     if not _have_rotations(reference, estimate):
         return np.zeros(0), np.zeros(0)
-    first, last, lengths = _segments_of(reference, lengths_m, step)
-    translations, rotations = _pair_errors(reference, estimate, first, last)
-    return translations / lengths, rotations / lengths
-
-
-def _segments_of(
-    path: Trajectory, lengths_m: Sequence[float], step: int
-) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return the first and last poses of the segments of a path, and their nominal lengths."""
-    distances = path.distances()
-    starts, lengths = np.meshgrid(np.arange(0, len(path), step), np.array(lengths_m, float))
+    distances = reference.distances()
+    starts, lengths = np.meshgrid(np.arange(0, len(reference), step), np.array(lengths_m, float))
     first, length = starts.ravel(), lengths.ravel()
     last = np.searchsorted(distances, distances[first] + length, side="right")
-    fits = last < len(path)
-    return first[fits], last[fits], length[fits]
+    fits = last < len(reference)
+    translations, rotations = _pair_errors(reference, estimate, first[fits], last[fits])
+    return translations / length[fits], rotations / length[fits]
 
 
 def usual_segments(path: Trajectory) -> tuple[tuple[float, ...], int]:
@@ -322,192 +311,6 @@ def _reference_share(reference: Trajectory, associated: Trajectory) -> float:
         return 1.0
     whole, part = (t.stamps_ns[-1] - t.stamps_ns[0] for t in (reference, associated))
     return float(part / whole)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Motions:
-    """Relative poses with their covariances.
-
-    Parameters
-    ----------
-    name : str
-        Whose they are, and over what.
-    start_ns, end_ns : ndarray of int64, shape (n,)
-        Stamps of the two poses, nanoseconds.
-    T_start_end : ndarray of float64, shape (n, 4, 4)
-        Metres.
-    covariances : ndarray of float64, shape (n, 6, 6)
-        Of (rx, ry, rz, tx, ty, tz), right perturbations, at the end.
-    """
-
-    name: str
-    start_ns: IntArray
-    end_ns: IntArray
-    T_start_end: FloatArray
-    covariances: FloatArray
-
-    @classmethod
-    def of_chain(cls, chain: Trajectory, first: IntArray, last: IntArray, *, name: str) -> Motions:
-        """Return the motions between poses of a chain with covariances: only there they subtract.
-
-        Parameters
-        ----------
-        chain : Trajectory
-            Each pose is the one before, moved by an independent measurement.
-        first, last : ndarray of int64, shape (n,)
-            Indices.
-        name : str
-        """
-        if chain.covariances is None:
-            chain = replace(chain, covariances=np.zeros((len(chain), 6, 6)))
-        T_start_end, covariances = chain.motions(first, last)
-        return cls(
-            name=name,
-            start_ns=chain.stamps_ns[first],
-            end_ns=chain.stamps_ns[last],
-            T_start_end=T_start_end,
-            covariances=covariances,
-        )
-
-
-def motions_of_chain(chain: Trajectory) -> list[Motions]:
-    """Return the motions of a raw chain over 1 s, over 10 s, and over segments of the path."""
-    stamps_ns, found = chain.stamps_ns, []
-    for span_s in (1, 10):
-        span_ns = span_s * 10**9
-        last = np.searchsorted(stamps_ns, stamps_ns + span_ns)
-        first = np.flatnonzero(last < len(chain))
-        first = first[stamps_ns[last[first]] - stamps_ns[first] <= 1.5 * span_ns]
-        found.append(Motions.of_chain(chain, first, last[first], name=f"raw over {span_s} s"))
-    lengths, step = usual_segments(chain)
-    first, last, _ = _segments_of(chain, lengths, step)
-    name = f"raw over {lengths[0]:g} to {lengths[-1]:g} m"
-    return [*found, Motions.of_chain(chain, first, last, name=name)]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Consistency(Motions):
-    """Motions with their errors, and covariances as stated.
-
-    Parameters
-    ----------
-    errors : ndarray of float64, shape (n, 6)
-        (rx, ry, rz, tx, ty, tz), radians and metres: right perturbations of the motions that give
-        the true ones.
-    """
-
-    errors: FloatArray
-
-    @property
-    def sigmas(self) -> FloatArray:
-        """Stated standard deviations, shape (n, 6)."""
-        return np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
-
-    def mean_nees(self) -> tuple[float, float]:
-        """Return the mean NEES per degree of freedom of rotations and of translations."""
-        rotation, translation = (
-            float(np.mean(se3.mahalanobis(self.errors[:, each], self.covariances[:, each, each])))
-            for each in (slice(0, 3), slice(3, 6))
-        )
-        return rotation / 3.0, translation / 3.0
-
-    def as_json(self) -> dict[str, str | int | float]:
-        """Return what `summary.json` holds of it; NEES are means per degree of freedom.
-
-        `nees_low` and `nees_high` bound 95 % of what chance makes of consistent covariances.
-        """
-        rotation, translation = self.mean_nees()
-        span_ns = np.median(self.end_ns - self.start_ns)
-        # Motions that overlap share their errors.
-        n_apart = max(1, int((self.end_ns.max() - self.start_ns.min()) // span_ns))
-        n_dof = N_DOF * min(n_apart, len(self.errors))
-        return {
-            "motion": self.name,
-            "n": len(self.errors),
-            "error_deg": float(np.rad2deg(np.sqrt(np.mean(self.errors[:, :3] ** 2) * 3))),
-            "error_m": float(np.sqrt(np.mean(self.errors[:, 3:] ** 2) * 3)),
-            "nees_rotation": rotation,
-            "nees_translation": translation,
-            "nees": 0.5 * (rotation + translation),
-            "nees_low": chi2_bound(0.025, n_dof) / n_dof,
-            "nees_high": chi2_bound(0.975, n_dof) / n_dof,
-        }
-
-
-def consistency(truth: Trajectory, motions: Motions) -> Consistency | None:
-    """Compare motions with the true ones, interpolated at their stamps.
-
-    Relative motions are compared, since an error of the first true pose would turn all that
-    follows.
-
-    Returns
-    -------
-    Consistency or None
-        None where no motion has both true poses and a covariance, or the truth no rotations.
-    """
-    if not truth.has_rotations:
-        return None
-    stamps_ns = np.unique([motions.start_ns, motions.end_ns])
-    true = truth.interpolate(stamps_ns, max_gap_ns=MAX_GAP_NS)
-    are_known = np.isin([motions.start_ns, motions.end_ns], true.stamps_ns).all(axis=0)
-    are_known &= _is_positive(motions.covariances)
-    if not are_known.any():
-        return None
-    start_ns, end_ns = motions.start_ns[are_known], motions.end_ns[are_known]
-    T_a, T_b = (true.T_world_frame[np.searchsorted(true.stamps_ns, s)] for s in (start_ns, end_ns))
-    T_start_end = motions.T_start_end[are_known]
-    return Consistency(
-        name=motions.name,
-        start_ns=start_ns,
-        end_ns=end_ns,
-        T_start_end=T_start_end,
-        errors=se3.log(se3.invert(T_start_end) @ se3.invert(T_a) @ T_b),
-        covariances=motions.covariances[are_known],
-    )
-
-
-def truth_jump(truth: Trajectory, estimate: Trajectory) -> float | None:
-    """Return by how much the noise of true positions moves them from frame to frame, metres.
-
-    Of how a step differs from the one before, the motion is in both trajectories; what of it the
-    truth has alone is its own noise, what the estimate has alone is not counted.
-
-    Returns
-    -------
-    float or None
-        None for fewer than three poses in common, or without rotations.
-    """
-    true = truth.interpolate(estimate.stamps_ns, max_gap_ns=MAX_GAP_NS)
-    poses = estimate.select(np.isin(estimate.stamps_ns, true.stamps_ns)).T_world_frame
-    if len(poses) < _MIN_POSES or not _have_rotations(truth, estimate):
-        return None
-    true_steps, steps = (se3.invert(T[:-1]) @ T[1:] for T in (true.T_world_frame, poses))
-    changes, others = (np.diff(each[:, :3, 3], axis=0) for each in (true_steps, steps))
-    # the median, as an estimate that is lost does not share the motion; noise of a position has
-    # the variance 2 in a step, 6 in the difference of two
-    shared = np.median(np.sum(changes * (changes - others), axis=1))
-    return float(np.sqrt(max(shared, 0.0) / 3.0))
-
-
-def _is_positive(covariances: FloatArray) -> BoolArray:
-    # normalized by the sigmas: metres and radians have different scales
-    variances = np.diagonal(covariances, axis1=1, axis2=2)
-    scales = np.sqrt(np.where(variances > 0.0, variances, 1.0))
-    unit = covariances / (scales[:, :, np.newaxis] * scales[:, np.newaxis])
-    smallest = np.linalg.eigvalsh(unit)[:, 0]
-    return np.asarray(np.all(variances > 0.0, axis=1) & (smallest > 1e-12))
-
-
-def chi2_bound(share: float, n_dof: int = N_DOF) -> float:
-    """Return a quantile of chi-square, by default with 6 degrees of freedom.
-
-    Examples
-    --------
-    >>> round(chi2_bound(0.95), 3)
-    12.592
-    """
-    # scipy.stats takes longer to import than a report to write
-    return 2.0 * float(gammaincinv(0.5 * n_dof, share))
 
 
 def format_evaluations(evaluations: Sequence[Evaluation]) -> str:

@@ -24,7 +24,7 @@ import numpy as np
 import gvo
 from gvo.io.recording import Source
 from gvo.runs.loop import edge_over, motions_of_window
-from gvo.trajectory.evaluation import Motions, consistency, motions_of_chain
+from gvo.trajectory.consistency import Motions, consistency, motions_of_chain
 from gvo.types import Edge
 
 from . import recordings
@@ -116,7 +116,7 @@ def errors_of(source: Source, settings: Sequence[str], *, first: int = 0) -> Mea
                 edges.append((result.stamp_ns, edge))
     trajectories = run.trajectories()
     motions = [
-        *motions_of_chain(trajectories["raw"])[: len(SPANS_S)],
+        *(motions_of_chain(trajectories["raw"], span_s) for span_s in SPANS_S),
         *(motions_of_window(edges, name="window") for edges in in_window.values()),
     ]
     segments = {"segments": [20.0, 50.0], "segment_step": 1}
@@ -131,7 +131,7 @@ def errors_of(source: Source, settings: Sequence[str], *, first: int = 0) -> Mea
 def mean_nees(truth: gvo.Trajectory, motions: Motions) -> tuple[float, float]:
     """Return the mean NEES of rotation and of translation, NaN where there is none."""
     compared = consistency(truth, motions)
-    return (np.nan, np.nan) if compared is None else compared.mean_nees()
+    return (np.nan, np.nan) if compared is None else compared.mean_nees()[:2]
 
 
 def print_recordings(sources: Sequence[Source], settings: Sequence[str]) -> None:

@@ -69,11 +69,13 @@ def test_summary_tells_the_path_and_how_the_covariances_fit(run_dir: Path) -> No
     assert summary["path_m"] == pytest.approx(truth.distances()[-1], rel=0.01)
     assert summary["extent_m"] == pytest.approx(summary["path_m"], rel=0.1)
     assert 0.0 <= summary["truth_jump_m"] < 1e-3  # it is exact
-    rows = summary["covariances"]
-    assert [row["motion"] for row in rows] == ["window over 1 s", "raw over 1 s"]
-    assert [row["n"] for row in rows] == [1, 10]
-    for row in rows:
-        assert 0.02 < row["nees"] < 5.0
+    assert summary["heading_deg"] < 5.0  # the camera looks along the road
+    for name, n in (("window", 1), ("raw", 10)):
+        assert summary["nees"][name]["5s"] == {}
+        row = summary["nees"][name]["1s"]["bare"]
+        assert row["n"] == n
+        assert all(0.001 < row[key] < 5.0 for key in ("rotation", "translation"))
+        assert 0.0 < row["along"] < 5.0
         assert 0.0 < row["error_m"] < 0.05
 
 

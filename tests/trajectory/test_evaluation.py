@@ -22,11 +22,10 @@ from gvo.trajectory.evaluation import (
     evaluate,
     evaluations_json,
     relative_errors,
-    truth_jump,
 )
 from gvo.trajectory.formats import read_trajectory, write_kitti, write_tum
 from gvo.trajectory.trajectory import Trajectory
-from tests.trajectory.paths import circle, seeds, straight, unturned
+from tests.trajectory.paths import circle, seeds, straight
 
 ALIGNED: tuple[AlignMode, ...] = ("se3", "sim3")
 
@@ -334,30 +333,3 @@ def test_against_positions_the_place_is_measured_and_no_rotation() -> None:
         np.testing.assert_allclose(bare.errors_m, full.errors_m, atol=1e-9)
         assert measures(bare) == [pytest.approx(full.ate_m), None, None, None, None]
         assert (bare.n_segments, bare.reference_share, bare.path_ratio) == (0, 1.0, full.path_ratio)
-
-
-def shaken(*, noise_m: float = 0.0, seed: int = 0) -> Trajectory:
-    """Return 300 poses of a camera in a shaking hand; their own noise is independent."""
-    phases = np.outer(np.arange(300), [0.31, 0.23, 0.17])
-    noise = np.random.default_rng(seed).normal(scale=noise_m, size=phases.shape)
-    poses = unturned(0.2 * np.sin(phases) + noise)
-    return Trajectory(stamps_ns=np.arange(300) * 33_000_000, T_world_frame=poses)
-
-
-@pytest.mark.parametrize("estimated_m", [0.0, 1e-3, 3e-3])
-def test_the_jump_of_the_truth_is_its_own_noise_and_not_that_of_the_estimate(
-    estimated_m: float,
-) -> None:
-    estimate = shaken(noise_m=estimated_m, seed=1)
-    # a step is the difference of two positions of three axes each
-    assert truth_jump(shaken(noise_m=1e-2), estimate) == pytest.approx(6**0.5 * 1e-2, rel=0.3)
-    jump_m = truth_jump(shaken(), estimate)
-    assert jump_m is not None
-    assert jump_m < 1e-3
-
-
-def test_the_jump_of_the_truth_needs_three_poses_with_rotations() -> None:
-    truth = straight(5)
-    assert truth_jump(truth, truth.select(slice(2))) is None
-    assert truth_jump(truth, truth.select(slice(3))) == pytest.approx(0.0, abs=1e-9)
-    assert truth_jump(Trajectory.of_positions(truth.stamps_ns, truth.positions), truth) is None

@@ -19,7 +19,8 @@ from gvo.io.bag.reader import MessageReader
 from gvo.io.bag.topics import Topic
 from gvo.io.edges.events import InputFaults
 from gvo.io.poses.tf import TfBuffer, read_tf
-from gvo.trajectory.evaluation import Evaluation, evaluate, truth_jump
+from gvo.trajectory.consistency import truth_jump
+from gvo.trajectory.evaluation import Evaluation, evaluate
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import BoolArray, Failure, FloatArray, IntArray
 

@@ -11,6 +11,8 @@ from gvo.io.run_folder.writer import GLOBAL
 _REST_M = 0.05
 # Sigmas that are right within this factor fit.
 _FIT_FACTOR = 2.0
+# A camera that looks so nearly along so long a way is driven.
+_HEADING_DEG, _DRIVE_M = 15.0, 20.0
 # What was learnt of a camera is told from here on, and where it is more than three sigmas.
 _DISPARITY_PX, _ROW_PX = 1.0, 0.5
 _READOUT_MS = 5.0
@@ -124,23 +126,50 @@ def loop_words(summary: Mapping[str, Any]) -> str:
 
 
 def _how_sure(summary: Mapping[str, Any]) -> str:
-    rows = summary.get("covariances")
-    if not rows:
+    found = summary.get("nees") or {}
+    of_second = (found.get(name, {}).get("1s") for name in ("window", "raw"))
+    ways: Mapping[str, Any] = next(filter(None, of_second), {})
+    if not ways:
         return ""
-    row = rows[0]
-    factor, span = row["nees"] ** 0.5, row["motion"].partition(" ")[2]
-    if factor < 1.0 / _FIT_FACTOR and row["nees"] < row["nees_low"]:
+    row = ways.get("fitted") or ways["bare"]
+    heading_deg, path_m = summary.get("heading_deg"), summary.get("path_m") or 0.0
+    if heading_deg is None or heading_deg > _HEADING_DEG or path_m <= _DRIVE_M:
+        nees, rest = 0.5 * (row["rotation"] + row["translation"]), ""
+    else:
+        nees = 0.75 * row["rotation"] + 0.25 * row["along"]
+        rest = "; across the way the reference cannot tell"
+    return _fit_words(nees, row, summary.get("truth_jump_m") or 0.0, "fitted" in ways) + rest
+
+
+def _fit_words(nees: float, row: Mapping[str, Any], jump_m: float, is_fitted: bool) -> str:
+    factor = nees**0.5
+    if factor < 1.0 / _FIT_FACTOR and nees < row["low"]:
         return f"are too large, {1.0 / factor:.2g} times in sigma"
-    if factor <= _FIT_FACTOR or row["nees"] <= row["nees_high"]:
+    if factor <= _FIT_FACTOR or nees <= row["high"]:
         return "fit"
     # Noise of the true poses is as large from frame to frame; errors of a motion add up.
-    jump_m = summary.get("truth_jump_m") or 0.0
     if jump_m > 0.5 * row["error_m"]:
         return f"cannot be judged, the truth jumps by {jump_m:.2g} m between frames"
-    return (
-        f"are too small, {factor:.2g} times in sigma, unless the truth itself is off by "
-        f"{row['error_m']:.2g} m and {row['error_deg']:.2g} deg {span}"
-    )
+    off = f"{row['error_m']:.2g} m and {row['error_deg']:.2g} deg over 1 s"
+    rest = "" if is_fitted else f", unless the truth itself is off by {off}"
+    return f"are too small, {factor:.2g} times in sigma{rest}"
+
+
+def nees_table(nees: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """Return the NEES of a summary as a table of text, the header first; empty without any."""
+    rows = [
+        (
+            f"{name} over {span.removesuffix('s')} s, {way}",
+            str(row["n"]),
+            *(f"{row[key]:.2f}" for key in ("rotation", "translation", "along")),
+            f"{row['low']:.2f} to {row['high']:.2f}",
+        )
+        for name, spans in nees.items()
+        for span, ways in spans.items()
+        for way, row in ways.items()
+    ]
+    header = ("NEES of motions", "n", "rotation", "translation", "along the way", "by chance")
+    return [header, *rows] if rows else []
 
 
 def _looks_at_frames(summary: Mapping[str, Any]) -> list[str]:

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from gvo.io.run_folder.reader import Table
 from gvo.trajectory.alignment import AlignMode
-from gvo.trajectory.evaluation import KITTI_SEGMENTS_M, N_DOF, Consistency, Evaluation, chi2_bound
+from gvo.trajectory.consistency import N_DOF, Consistency, chi2_bound
+from gvo.trajectory.evaluation import KITTI_SEGMENTS_M, Evaluation
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
 from gvo.viz import palette

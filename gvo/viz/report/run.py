@@ -13,15 +13,10 @@ from gvo._text import number_text
 from gvo.config import Config
 from gvo.errors import TrajectoryError
 from gvo.io.run_folder.reader import RunRecord, Table, loop_ends
-from gvo.io.run_folder.verdict import loop_words, verdict
+from gvo.io.run_folder.verdict import loop_words, nees_table, verdict
 from gvo.trajectory.alignment import AlignMode
-from gvo.trajectory.evaluation import (
-    Evaluation,
-    consistency,
-    evaluate,
-    evaluation_table,
-    motions_of_chain,
-)
+from gvo.trajectory.consistency import consistency, motions_of_chain
+from gvo.trajectory.evaluation import Evaluation, evaluate, evaluation_table
 from gvo.trajectory.trajectory import Trajectory
 from gvo.viz.figures import Plot, elapsed, evenly, style, write_plots
 from gvo.viz.measures import truth_around
@@ -204,7 +199,7 @@ def _truth_plots(record: RunRecord, compared: list[Evaluation], reason: str) -> 
 
 def _covariance_plot(record: RunRecord, truth: Trajectory) -> Plot:
     raw = record.trajectories["raw"]
-    found = consistency(truth, motions_of_chain(raw)[0]) if len(raw) else None
+    found = consistency(truth, motions_of_chain(raw)) if len(raw) else None
     if found is not None:
         return covariance_plot(found, _first_ns(record))
     reason = (
@@ -229,6 +224,7 @@ def _words(record: RunRecord) -> dict[str, Any]:
         "summary": summary,
         "verdict": verdict(summary) if "frames" in summary else "",
         "loop_words": loop_words(summary),
+        "nees": nees_table(summary.get("nees") or {}),
         "statuses": Counter(record.frames["status"]),
         "duration": _duration(record),
         "loops": _loops(record.loops, _first_ns(record)),

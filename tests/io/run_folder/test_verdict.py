@@ -4,12 +4,17 @@ from typing import Any
 
 import pytest
 
-from gvo.io.run_folder.verdict import loop_words, verdict
+from gvo.io.run_folder.verdict import loop_words, nees_table, verdict
 
 
-def row(nees: float, *, error_m: float = 0.05, motion: str = "window over 1 s") -> dict[str, Any]:
-    told = {"motion": motion, "n": 40, "error_m": error_m, "error_deg": 0.1}
-    return told | {"nees": nees, "nees_low": 0.6, "nees_high": 1.5}
+def row(nees: float, *, error_m: float = 0.05, **changes: float) -> dict[str, Any]:
+    told = {"rotation": nees, "translation": nees, "along": nees, "low": 0.6, "high": 1.5}
+    return told | {"n": 40, "error_m": error_m, "error_deg": 0.1} | changes
+
+
+def nees(bare: dict[str, Any], fitted: dict[str, Any] | None = None) -> dict[str, Any]:
+    ways = {"bare": bare} | ({"fitted": fitted} if fitted else {})
+    return {"raw": {"1s": {"bare": row(7.0)}, "5s": {}}, "window": {"1s": ways, "5s": {}}}
 
 
 def summary(**changes: Any) -> dict[str, Any]:
@@ -27,7 +32,7 @@ def summary(**changes: Any) -> dict[str, Any]:
             for name, ate_m in (("raw", 0.52), ("smoothed", 0.304))
         ],
         "truth_jump_m": 0.004,
-        "covariances": [row(1.1), row(7.0, motion="raw over 1 s")],
+        "nees": nees(row(1.1)),
         "rig_offsets": None,
         "warnings": [],
     }
@@ -36,7 +41,7 @@ def summary(**changes: Any) -> dict[str, Any]:
 
 
 def without_truth(**changes: Any) -> dict[str, Any]:
-    return summary(errors=[], covariances=[], **changes)
+    return summary(errors=[], nees={}, **changes)
 
 
 def optimum(counted: int, **refused: int) -> dict[str, Any]:
@@ -91,7 +96,7 @@ CASES = [
     ),
     # global poses are the best where loops were closed, and else as good as the smoothed ones
     (
-        summary(errors=CLOSED, covariances=[], **{"global": optimum(3, odd=2)}),
+        summary(errors=CLOSED, nees={}, **{"global": optimum(3, odd=2)}),
         "298 m in 393 frames, all tracked; 0.1 m from the truth with loops closed.",
     ),
 ]
@@ -116,6 +121,10 @@ def test_causes_come_before_looks_and_covariances() -> None:
 
 
 FIT = "fit"
+SMALL = (
+    "are too small, 4.2 times in sigma, unless the truth itself is off by 0.091 m and 0.1 deg "
+    "over 1 s"
+)
 
 
 @pytest.mark.parametrize(
@@ -126,9 +135,8 @@ FIT = "fit"
         (row(0.26), FIT),
         (row(0.04), "are too large, 5 times in sigma"),
         (
-            row(324.0, error_m=0.091),
-            "are too small, 18 times in sigma, unless the truth itself is off by 0.091 m "
-            "and 0.1 deg over 1 s",
+            row(18.0, error_m=0.091),
+            SMALL,
         ),
         # the error over a second is hardly larger than what the truth jumps by between frames
         (
@@ -136,13 +144,61 @@ FIT = "fit"
             "cannot be judged, the truth jumps by 0.004 m between frames",
         ),
         # of so few motions chance makes more
-        (row(5.0) | {"nees_high": 6.0}, FIT),
-        (row(0.2) | {"nees_low": 0.1}, FIT),
+        (row(5.0, high=6.0), FIT),
+        (row(0.2, low=0.1), FIT),
+        # rotation and translation count alike, a hand has no way to be along
+        (row(0.0, rotation=10.0, translation=26.0, error_m=0.091), SMALL),
     ],
 )
 def test_the_verdict_judges_the_covariances(found: dict[str, Any], words: str) -> None:
-    said = verdict(summary(covariances=[found]))
+    said = verdict(summary(nees=nees(found)))
     assert said == f"298 m in 393 frames, all tracked; 0.3 m from the truth. Covariances {words}."
+
+
+@pytest.mark.parametrize(
+    ("found", "words"),
+    [
+        (row(9.0), "are too small, 3 times in sigma"),
+        (row(1.0), FIT),
+        (row(0.04), "are too large, 5 times in sigma"),
+    ],
+)
+def test_a_fitted_reference_is_judged_by_alone(found: dict[str, Any], words: str) -> None:
+    assert verdict(summary(nees=nees(row(400.0), found))).endswith(f"Covariances {words}.")
+
+
+def test_without_motions_of_the_window_the_raw_chain_is_judged() -> None:
+    told = nees(row(1.0)) | {"window": {"1s": {}, "5s": {}}}
+    assert "Covariances are too small, 2.6 times" in verdict(summary(nees=told))
+
+
+ACROSS = "; across the way the reference cannot tell"
+
+
+@pytest.mark.parametrize(
+    ("found", "words"),
+    [
+        # three degrees of freedom turn, one is along the way
+        (row(0.0, rotation=11.0, translation=1e4, along=3.0), "are too small, 3 times in sigma"),
+        (row(0.0, rotation=1.0, translation=1e4, along=1.0), FIT),
+    ],
+)
+def test_a_drive_is_judged_by_rotation_and_along(found: dict[str, Any], words: str) -> None:
+    drive = summary(nees=nees(row(1.0), found), heading_deg=4.0)
+    assert verdict(drive).endswith(f"Covariances {words}{ACROSS}.")
+    for other in ({"path_m": 19.0}, {"heading_deg": 16.0}, {"heading_deg": None}):
+        assert "across" not in verdict(drive | other)
+
+
+def test_the_table_of_nees_has_a_row_for_each_way() -> None:
+    (_, *first), *rows = nees_table(nees(row(7.0), row(1.5, along=0.25)))
+    assert first[-1] == "by chance"
+    assert rows == [
+        ("raw over 1 s, bare", "40", "7.00", "7.00", "7.00", "0.60 to 1.50"),
+        ("window over 1 s, bare", "40", "7.00", "7.00", "7.00", "0.60 to 1.50"),
+        ("window over 1 s, fitted", "40", "1.50", "1.50", "0.25", "0.60 to 1.50"),
+    ]
+    assert nees_table({}) == []
 
 
 ANEW = ": calibrate anew"

@@ -1,0 +1,153 @@
+"""Covariances against the truth: by the motions between poses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gvo.geometry import se3
+from gvo.trajectory.consistency import (
+    Consistency,
+    Motions,
+    consistency,
+    motions_of_chain,
+    truth_jump,
+)
+from gvo.trajectory.trajectory import Trajectory
+from tests.trajectory.paths import circle, straight, unturned
+
+# Of a step of 0.1 s, at its end.
+COVARIANCE = np.diag([1e-6, 4e-6, 1e-6, 1e-4, 1e-4, 9e-4])
+
+
+def chain_along(truth: Trajectory, *, stated: float = 1.0) -> Trajectory:
+    """Return a chain of noisy steps, with the covariances that its noise makes, times a factor."""
+    noise = np.random.default_rng(1).multivariate_normal(np.zeros(6), COVARIANCE, size=len(truth))
+    T, C = [np.eye(4)], [np.zeros((6, 6))]
+    for k, step in enumerate(se3.invert(truth.T_world_frame[:-1]) @ truth.T_world_frame[1:]):
+        moved = step @ se3.invert(se3.exp(noise[k]))
+        Ad = se3.adjoint(se3.invert(moved))
+        T.append(T[-1] @ moved)
+        C.append(Ad @ C[-1] @ Ad.T + stated * COVARIANCE)
+    return Trajectory(stamps_ns=truth.stamps_ns, T_world_frame=np.array(T), covariances=np.array(C))
+
+
+def found_in(truth: Trajectory, motions: Motions) -> Consistency:
+    found = consistency(truth, motions)
+    assert found is not None
+    return found
+
+
+def test_a_chain_whose_covariances_are_right_gives_one_over_all_spans() -> None:
+    truth = circle(3000)
+    chain = chain_along(truth)
+    for span_s, tolerance in ((1, 0.15), (5, 0.3)):
+        motions = motions_of_chain(chain, span_s)
+        np.testing.assert_allclose(1e-9 * (motions.end_ns - motions.start_ns), span_s)
+        assert motions.name == f"raw over {span_s} s"
+        np.testing.assert_allclose(found_in(truth, motions).mean_nees(), 1.0, atol=tolerance)
+
+
+@pytest.mark.parametrize("stated", [0.01, 1.0, 100.0])
+def test_covariances_are_told_by_chance_and_factor(stated: float) -> None:
+    truth = circle(500)
+    found = found_in(truth, motions_of_chain(chain_along(truth, stated=stated)))
+    told = found.as_json()
+    for name in ("rotation", "translation", "along"):
+        assert told[name] == pytest.approx(1.0 / stated, rel=0.3)
+    # 49 motions that do not overlap, of six degrees of freedom each
+    assert told["low"] == pytest.approx(1.0 - 1.96 * np.sqrt(2 / 294), abs=0.01)
+    assert told["high"] == pytest.approx(1.0 + 1.96 * np.sqrt(2 / 294), abs=0.01)
+    assert told["n"] == 490
+    turns, shifts = (np.linalg.norm(found.errors[:, each], axis=1) for each in np.s_[:3, 3:])
+    assert told["error_deg"] == pytest.approx(np.rad2deg(np.sqrt(np.mean(turns**2))))
+    assert told["error_m"] == pytest.approx(np.sqrt(np.mean(shifts**2)))
+    assert told["error_m"] == pytest.approx(np.sqrt(10 * 11e-4), rel=0.3)
+
+
+def test_errors_across_the_way_are_not_along_it() -> None:
+    truth = circle(100)
+    step = se3.invert(truth.T_world_frame[0]) @ truth.T_world_frame[10]
+    backward = se3.invert(step)[:3, 3]  # of the motion, in the frame at its end
+    aside = np.cross(backward, [0.0, 1.0, 0.0])
+    for error, is_along in ((backward, True), (aside, False)):
+        moved = step @ se3.exp(np.concatenate([np.zeros(3), 0.01 * error]))
+        motions = Motions(
+            name="one",
+            start_ns=truth.stamps_ns[:1],
+            end_ns=truth.stamps_ns[10:11],
+            T_start_end=moved[np.newaxis],
+            covariances=1e-4 * np.eye(6)[np.newaxis],
+        )
+        rotation, translation, along = found_in(truth, motions).mean_nees()
+        length = float(error @ error)
+        assert rotation == pytest.approx(0.0, abs=1e-9)
+        assert translation == pytest.approx(length / 3.0, rel=0.05)
+        assert along == pytest.approx(length if is_along else 0.0, rel=0.05, abs=1e-3 * length)
+
+
+def test_of_a_camera_at_rest_the_optical_axis_is_along() -> None:
+    truth = Trajectory(
+        stamps_ns=np.arange(11) * 10**8, T_world_frame=np.tile(np.eye(4), (11, 1, 1))
+    )
+    motions = motions_of_chain(replace(truth, covariances=np.tile(COVARIANCE, (11, 1, 1))))
+    motions = replace(motions, covariances=COVARIANCE[np.newaxis])
+    told = found_in(truth, motions).as_json()
+    assert told["along"] == 0.0
+
+
+def test_the_truth_is_interpolated_at_the_stamps_of_the_estimate() -> None:
+    truth = circle(200)
+    between = truth.interpolate(truth.stamps_ns[:-1] + 50_000_000)
+    covariances = np.tile(COVARIANCE, (len(between), 1, 1))
+    estimate = Trajectory(
+        stamps_ns=between.stamps_ns, T_world_frame=between.T_world_frame, covariances=covariances
+    )
+    stamps_ns = between.stamps_ns
+    motions = Motions(
+        name="exact",
+        start_ns=stamps_ns[:-10],
+        end_ns=stamps_ns[10:],
+        T_start_end=se3.invert(estimate.T_world_frame[:-10]) @ estimate.T_world_frame[10:],
+        covariances=covariances[10:],
+    )
+    found = consistency(truth, motions)
+    assert found is not None
+    assert np.abs(found.errors).max() < 1e-9
+
+
+def test_without_rotations_or_covariances_there_is_nothing_to_compare() -> None:
+    truth = circle(30)
+    chain = chain_along(truth)
+    motions, over_5_s = (motions_of_chain(chain, span_s) for span_s in (1, 5))
+    assert consistency(Trajectory.of_positions(truth.stamps_ns, truth.positions), motions) is None
+    assert consistency(truth, motions_of_chain(truth)) is None
+    assert consistency(truth.select([0]), motions) is None
+    assert consistency(truth, over_5_s) is None
+
+
+def shaken(*, noise_m: float = 0.0, seed: int = 0) -> Trajectory:
+    """Return 300 poses of a camera in a shaking hand; their own noise is independent."""
+    phases = np.outer(np.arange(300), [0.31, 0.23, 0.17])
+    noise = np.random.default_rng(seed).normal(scale=noise_m, size=phases.shape)
+    poses = unturned(0.2 * np.sin(phases) + noise)
+    return Trajectory(stamps_ns=np.arange(300) * 33_000_000, T_world_frame=poses)
+
+
+@pytest.mark.parametrize("estimated_m", [0.0, 1e-3, 3e-3])
+def test_the_jump_of_the_truth_is_its_own_noise_and_not_that_of_the_estimate(
+    estimated_m: float,
+) -> None:
+    estimate = shaken(noise_m=estimated_m, seed=1)
+    # a step is the difference of two positions of three axes each
+    assert truth_jump(shaken(noise_m=1e-2), estimate) == pytest.approx(6**0.5 * 1e-2, rel=0.3)
+    jump_m = truth_jump(shaken(), estimate)
+    assert jump_m is not None
+    assert jump_m < 1e-3
+
+
+def test_the_jump_of_the_truth_needs_three_poses_with_rotations() -> None:
+    truth = straight(5)
+    assert truth_jump(truth, truth.select(slice(2))) is None
+    assert truth_jump(truth, truth.select(slice(3))) == pytest.approx(0.0, abs=1e-9)
+    assert truth_jump(Trajectory.of_positions(truth.stamps_ns, truth.positions), truth) is None
