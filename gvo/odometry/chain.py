@@ -81,18 +81,6 @@ class RawStep:
     is_steady: bool = False
     n_steps: int = 0
 
-    def stated(self) -> Estimate:
-        """Return the pose, named by its stamp, with the covariance that contains all of it."""
-        covariance, effects = self.covariance, self.effects
-        if effects is not None:
-            covariance = covariance + effects @ effects.T
-        return replace(
-            self.estimate,
-            frame_id=self.estimate.stamp_ns,
-            covariance=covariance,
-            effects=effects,
-        )
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Node(Generic[ObservationsT]):

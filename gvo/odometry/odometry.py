@@ -20,6 +20,7 @@ from gvo.frontend.offsets import RigOffsets
 from gvo.frontend.protocol import CheckedFrontend, Frontend, count_points
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
+from gvo.geometry.edges import NO_EFFECTS
 from gvo.odometry.chain import RawChain, RawStep
 from gvo.odometry.graph import RunGraph
 from gvo.odometry.keyframes import Keyframes, judge_links, link_keyframes, misclosure
@@ -286,12 +287,18 @@ class Odometry:
     ) -> FrameResult:
         n_keypoints, n_points = count_points(observations)
         answer = step.registration or step.failure
+        effects = NO_EFFECTS if step.effects is None else step.effects
         finished = tuple(self._window.pop_finished())
         self._map.graph.settle(finished)
         for estimate in (step.estimate, causal):
             self._poses.extend(estimate.T_world_frame[:3].ravel())
         return FrameResult(
-            raw=step.stated(),
+            raw=replace(
+                step.estimate,
+                frame_id=step.estimate.stamp_ns,
+                covariance=step.covariance + effects @ effects.T,
+                effects=step.effects,
+            ),
             causal=causal,
             finished=finished,
             status=causal.status,

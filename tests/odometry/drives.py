@@ -39,10 +39,25 @@ def block(n_laps: float = 1.2, *, n_per_lap: int = 200, side_m: float = 50.0) ->
 
 
 def measured(
-    truth: FloatArray, i: int, j: int, sigmas: FloatArray, rng: Rng, *, bias: Bias = None
+    truth: FloatArray,
+    i: int,
+    j: int,
+    sigmas: FloatArray,
+    rng: Rng,
+    *,
+    bias: Bias = None,
+    told: Bias = None,
 ) -> Edge:
-    """Return the edge from frame i to frame j, with noise and a bias of its scale and yaw."""
+    """Return the edge from frame i to frame j, with noise and a bias of its scale and yaw.
+
+    If the sizes of both are told, the edge has their effects.
+    """
     T = se3.invert(truth[i]) @ truth[j]
+    effects = None
+    if told is not None:
+        effects = np.zeros((6, 2))
+        effects[3:, 0] = told[0] * T[:3, :3].T @ T[:3, 3]
+        effects[1, 1] = told[1] * np.linalg.norm(T[:3, 3])
     if bias is not None:
         scale, yaw = bias
         T = T.copy()
@@ -54,6 +69,7 @@ def measured(
         reference_id=i * PERIOD_NS,
         T_reference_frame=T @ se3.exp(noise),
         covariance=np.diag(sigmas**2),
+        effects=effects,
     )
 
 
@@ -68,10 +84,12 @@ class Drive:
         every: int = 5,
         n_links: int = 2,
         bias: Bias = None,
+        told: Bias = None,
         sigmas: FloatArray = SIGMAS,
         max_frames: int = 3000,
     ) -> None:
         self.truth, self.rng, self.bias, self.sigmas = truth, rng, bias, sigmas
+        self.told = told
         self.graph = RunGraph(max_frames=max_frames)
         self.every, self.n_links = every, n_links
         self.keyframes = [0]
@@ -82,18 +100,20 @@ class Drive:
         """Add frame j, measured from the frame before and from the latest keyframes."""
         edges: list[Edge] = []
         if j > 0:
-            edges.append(measured(self.truth, j - 1, j, self.sigmas, self.rng, bias=self.bias))
+            edges.append(self._measured(j - 1, j, self.sigmas))
             self.T = self.T @ edges[0].T_reference_frame
             for k in self.keyframes[-self.n_links :] if self.n_links else []:
                 if k < j - 1:
-                    sigmas = 1.5 * self.sigmas
-                    edges.append(measured(self.truth, k, j, sigmas, self.rng, bias=self.bias))
+                    edges.append(self._measured(k, j, 1.5 * self.sigmas))
         is_keyframe = j % self.every == 0
         estimate = estimate_at(j * PERIOD_NS, self.T, frame_id=j * PERIOD_NS)
         self.edges.append(edges)
         self.graph.add_frame(estimate, edges, is_place=is_keyframe)
         if is_keyframe and j > 0:
             self.keyframes.append(j)
+
+    def _measured(self, i: int, j: int, sigmas: FloatArray) -> Edge:
+        return measured(self.truth, i, j, sigmas, self.rng, bias=self.bias, told=self.told)
 
     def run(self) -> Drive:
         for j in range(len(self.truth)):

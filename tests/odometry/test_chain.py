@@ -28,9 +28,16 @@ class TrueFrontend:
     """Registers frames at known poses, but those of `blank`; remembers what it was asked."""
 
     def __init__(
-        self, pose: Callable[[int], FloatArray], blank: set[int], passing_share: float = 0.0
+        self,
+        pose: Callable[[int], FloatArray],
+        blank: set[int],
+        passing_share: float = 0.0,
+        *,
+        shared: FloatArray | None = None,
+        bend: FloatArray | None = None,
     ) -> None:
         self._pose = pose
+        self._shared, self._bend = shared, np.zeros(6) if bend is None else bend
         self._blank = blank
         self._passing_share = passing_share
         self.asked: list[tuple[int, int, MotionPrior | None]] = []
@@ -46,8 +53,9 @@ class TrueFrontend:
         if a in self._blank or b in self._blank:
             return Failure(reason=f"nothing seen in {a} or {b}", n_matches=4, n_inliers=2)
         return RelativePose(
-            T_reference_current=np.linalg.inv(self._pose(a)) @ self._pose(b),
+            T_reference_current=np.linalg.inv(self._pose(a)) @ self._pose(b) @ se3.exp(self._bend),
             covariance=COVARIANCE,
+            shared=self._shared,
             passing_covariance=self._passing_share * COVARIANCE,
             matches=np.zeros((9, 2), dtype=np.int64),
             inliers=np.arange(9) < 7,
@@ -103,6 +111,22 @@ def test_what_passes_with_the_next_step_does_not_add_up() -> None:
         np.testing.assert_allclose(part.estimate.covariance, 0.25 * every.estimate.covariance)
     # A step is measured as well as it says.
     np.testing.assert_array_equal(edge_of(steps[0][-1]).covariance, COVARIANCE)
+
+
+def test_errors_that_registrations_share_move_poses_as_told() -> None:
+    shared, sizes = np.random.default_rng(1).normal(size=(6, 2)), np.array([1e-6, -2e-6])
+    blank = {stamps_of(6)[3]}
+    chain = RawChain(TrueFrontend(steady, blank, shared=shared))
+    bent = RawChain(TrueFrontend(steady, blank, shared=shared, bend=3.0 * shared @ sizes))
+    for stamp in stamps_of(6):
+        step = chain.advance(observe(stamp), observe(stamp), effects_factor=3.0)
+        other = advance(bent, stamp)
+        moved = se3.log(se3.invert(step.estimate.T_world_frame) @ other.estimate.T_world_frame)
+        if stamp == 0:
+            assert step.effects is None
+        elif stamp not in blank:  # there the bent velocity goes on, the told effects do not
+            assert step.effects is not None
+            np.testing.assert_allclose(step.effects @ sizes, moved, rtol=1e-3, atol=1e-8)
 
 
 @settings(max_examples=25)

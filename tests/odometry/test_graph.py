@@ -37,13 +37,14 @@ def looped(
     n_loops: int = 5,
     n_laps: float = 1.3,
     bias: Bias = None,
+    told: Bias = None,
     n_links: int = 2,
     max_frames: int = 3000,
 ) -> Drive:
     """Return a drive around the block and a bit more, with loops where it came back."""
     rng = None if seed is None else np.random.default_rng(seed)
     truth = block(n_laps, n_per_lap=N_LAP)
-    drive = Drive(truth, rng, bias=bias, n_links=n_links, max_frames=max_frames).run()
+    drive = Drive(truth, rng, bias=bias, told=told, n_links=n_links, max_frames=max_frames).run()
     drive.graph.loops = [drive.loop(5 * k, N_LAP + 5 * k) for k in range(n_loops)]
     return drive
 
@@ -95,6 +96,18 @@ def test_the_covariances_tell_the_errors() -> None:
         drive = looped(seed)
         found.append(nees(drive.graph.optimize(), drive.truth).mean())
     assert 3.5 < np.mean(found) < 7.0
+
+
+@pytest.mark.parametrize("max_frames", [3000, 30])
+def test_the_covariances_tell_the_errors_that_all_edges_share(max_frames: int) -> None:
+    sizes, found = np.array([0.003, 0.0003]), []
+    for seed in range(12):
+        bias = tuple(np.random.default_rng(seed).normal(size=2) * sizes)
+        drive = looped(seed, bias=bias, told=tuple(sizes), max_frames=max_frames)
+        optimum = drive.graph.optimize()
+        assert not any(loop.reason for loop in optimum.loops)
+        found.append(nees(optimum, drive.truth).mean())
+    assert 3.0 < np.mean(found) < 9.0
 
 
 @settings(max_examples=4)

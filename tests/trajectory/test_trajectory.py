@@ -1,5 +1,6 @@
 """The trajectory value: checks, frames, interpolation."""
 
+from dataclasses import replace
 from decimal import Decimal
 from typing import Any
 
@@ -169,3 +170,58 @@ def test_a_trajectory_prints_as_one_line() -> None:
     )
     assert repr(whole).endswith("5.00 m, with covariances)")
     assert str(known.select([])) == "Trajectory(no poses)"
+
+
+def shared_chain(n: int = 30) -> tuple[Trajectory, FloatArray]:
+    """Return a chain with noise and an error that its steps share, and what one step's noise is."""
+    rng = np.random.default_rng(4)
+    noise, shared = np.diag(np.repeat([1e-8, 1e-6], 3)), 1e-2 * rng.normal(size=(6, 2))
+    T, N, S = [np.eye(4)], [np.zeros((6, 6))], [np.zeros((6, 2))]
+    for _ in range(n - 1):
+        step = se3.exp(rng.normal(size=6))
+        back = se3.adjoint(se3.invert(step))
+        T.append(T[-1] @ step)
+        N.append(back @ N[-1] @ back.T + noise)
+        S.append(back @ S[-1] + shared)
+    covariances = [a + b @ b.T for a, b in zip(N, S, strict=True)]
+    chain = Trajectory(
+        stamps_ns=10 * np.arange(n),
+        T_world_frame=np.array(T),
+        covariances=np.array(covariances),
+        effects=np.array(S),
+    )
+    return chain, noise + shared @ shared.T
+
+
+def test_the_motion_over_one_step_is_as_certain_as_the_step() -> None:
+    chain, expected = shared_chain()
+    for k in (0, 7, 28):
+        motion = chain.motion(k, k + 1)
+        assert motion.reference_id == 10 * k
+        T = se3.invert(chain.T_world_frame[k]) @ chain.T_world_frame[k + 1]
+        np.testing.assert_allclose(motion.T_reference_frame, T)
+        np.testing.assert_allclose(motion.covariance, expected, rtol=1e-6, atol=1e-12)
+
+
+def test_from_the_start_a_motion_is_as_certain_as_the_pose() -> None:
+    chain, _ = shared_chain()
+    found, expected = chain.motion(0, 29).covariance, chain.covariances
+    assert expected is not None
+    np.testing.assert_allclose(found, expected[29], rtol=1e-6, atol=1e-9)
+
+
+def test_motions_of_another_frame_and_of_a_part_are_those_of_the_whole() -> None:
+    chain, _ = shared_chain()
+    part = chain.select(slice(5, 20))
+    np.testing.assert_allclose(part.motion(2, 9).covariance, chain.motion(7, 14).covariance)
+    T_frame_other = se3.exp(np.array([0.3, -0.2, 0.1, 1.0, 2.0, -1.0]))
+    moved = chain.transformed(T_frame_other).motion(7, 14).covariance
+    back = se3.adjoint(se3.invert(T_frame_other))
+    expected = back @ chain.motion(7, 14).covariance @ back.T
+    np.testing.assert_allclose(moved, expected, rtol=1e-6, atol=1e-12)
+
+
+def test_without_covariances_a_motion_has_none() -> None:
+    chain, _ = shared_chain()
+    with pytest.raises(ValueError, match="without covariances"):
+        replace(chain, covariances=None).motion(0, 1)

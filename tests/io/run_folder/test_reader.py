@@ -71,6 +71,38 @@ def _part(record: RunRecord, name: str) -> Sized:
     return parts[name]
 
 
+def test_what_shared_errors_do_to_raw_poses_is_read(copy: Path) -> None:
+    effects = np.load(copy / "effects.npy")
+    raw = read_run(copy).trajectories["raw"]
+    assert raw.effects is not None
+    np.testing.assert_array_equal(raw.effects, effects)
+    assert effects.shape == (N, 6, 9)
+    assert not effects[0].any()
+    assert effects[1:].any(axis=(1, 2)).all()
+    # Numpy's own file is the same, byte by byte.
+    np.save(copy / "again.npy", effects)
+    assert (copy / "again.npy").read_bytes() == (copy / "effects.npy").read_bytes()
+    # The covariance contains them.
+    covariances = np.array(raw.covariances) - effects @ np.swapaxes(effects, 1, 2)
+    assert np.linalg.eigvalsh(covariances[1:]).min() > 0.0
+    (copy / "effects.npy").unlink()
+    assert read_run(copy).trajectories["raw"].effects is None
+
+
+@pytest.mark.parametrize("content", [b"", b"a", b"half", b"scalar", b"pickle"])
+def test_a_damaged_file_of_effects_is_refused(copy: Path, content: bytes) -> None:
+    path = copy / "effects.npy"
+    if content == b"half":
+        content = path.read_bytes()[:-8]
+    elif content in (b"scalar", b"pickle"):
+        value = 1.0 if content == b"scalar" else np.array([{}] * N)
+        np.save(path, value, allow_pickle=True)
+        content = path.read_bytes()
+    path.write_bytes(content)
+    with pytest.raises(TrajectoryError, match=r"effects.npy: .* run again"):
+        read_run(copy)
+
+
 def test_loops_are_lines_between_their_poses(copy: Path) -> None:
     trajectory = read_run(copy).trajectories["global"]
     stamps_ns = trajectory.stamps_ns.tolist()

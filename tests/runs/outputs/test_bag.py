@@ -13,10 +13,13 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from gvo.errors import RecordingError
+from gvo.geometry import se3
+from gvo.geometry.edges import between
 from gvo.geometry.se3 import make_transform
 from gvo.io.poses.tf import TfBuffer
 from gvo.runs.outputs.bag import RunBag
 from gvo.runs.outputs.frames import RunFrames
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import (
     Estimate,
     FaultyFrame,
@@ -108,6 +111,7 @@ def _mounted(estimate: Estimate, T_base_cam: FloatArray) -> Estimate:
         estimate,
         T_world_frame=T_base_cam @ estimate.T_world_frame @ T_cam_frame,
         covariance=J @ estimate.covariance @ J.T,
+        effects=None if estimate.effects is None else J @ estimate.effects,
     )
 
 
@@ -317,8 +321,14 @@ def test_the_covariance_of_a_measured_velocity_is_that_of_the_registration(bag: 
             if index == 0 or registration is None:
                 np.testing.assert_array_equal(found, -np.eye(6))
                 continue
-            step = replace(bag.run.results[index].raw, covariance=registration.covariance)
-            expected = _mounted(step, bag.names.mount(0)).covariance
+            before, raw = (bag.run.results[n].raw for n in (index - 1, index))
+            # What shared errors make of the step comes on top of the noise of the registration.
+            both = Trajectory.of([before, raw])
+            assert both.effects is not None
+            start, end = both.effects
+            effects = between(start, end, se3.invert(before.T_world_frame) @ raw.T_world_frame)
+            covariance = registration.covariance + effects @ effects.T
+            expected = _mounted(replace(raw, covariance=covariance), bag.names.mount(0)).covariance
             elapsed_s = 1e-9 * (stamps[index] - stamps[index - 1])
             np.testing.assert_allclose(found * elapsed_s**2, expected, rtol=1e-4, atol=1e-12)
     for kind in ("causal", "smoothed"):
