@@ -15,7 +15,7 @@ import typer
 from typer import Argument, Option
 from typer.main import get_command
 
-from gvo._text import plain_floats, plain_number
+from gvo._text import exists, format_table, plain_floats, plain_number
 from gvo._version import __version__
 from gvo.cli import options as opt
 from gvo.cli.batch import batch
@@ -39,7 +39,7 @@ from gvo.cli.terminal import (
 from gvo.errors import ConfigurationError, GvoError, OutputError, flags_named, named_faults
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from gvo.io.edges.events import EdgeSource
     from gvo.runs.result import RunResult
@@ -309,7 +309,9 @@ def compare(
         str,
         Argument(help="Pose file, recording with truth, BAG#tf:PARENT:CHILD or BAG#TOPIC."),
     ],
-    estimates: Annotated[list[str], Argument(help="Pose files, BAG#tf:... or BAG#TOPIC.")],
+    estimates: Annotated[
+        list[str], Argument(help="Pose files, run folders, BAG#tf:... or BAG#TOPIC.")
+    ],
     align: Annotated[
         _Align, Option(metavar="HOW", help="Alignment: none, origin, se3, or sim3 with a scale.")
     ] = "se3",
@@ -336,6 +338,8 @@ def compare(
     """Measure trajectories against a reference: ATE, RPE, segments."""
     from gvo.io.poses.inputs import read_compared
     from gvo.io.run_folder.line_file import check_new
+    from gvo.io.run_folder.reader import pose_files, read_summary
+    from gvo.io.run_folder.writer import SUMMARY
     from gvo.trajectory.evaluation import evaluate, evaluations_json, format_evaluations
     from gvo.viz.names import PAGES, check_suffix
 
@@ -344,7 +348,9 @@ def compare(
             check_new(path, otherwise="--force to replace it")
     check_suffix(plot)
     check_suffix(report_file, PAGES)
-    truth, trajectories, notes = read_compared(reference, estimates)
+    runs = {text: read_summary(Path(text) / SUMMARY) for text in estimates if exists(Path(text))}
+    files = [file for text in estimates for file in pose_files(text)]
+    truth, trajectories, notes = read_compared(reference, files)
     warn(notes)
     trajectories = {
         name: _by_clock(truth, each, name, offset) for name, each in trajectories.items()
@@ -357,10 +363,17 @@ def compare(
         for name, each in trajectories.items()
     ]
     if as_json:
-        typer.echo(json.dumps(evaluations_json(evaluations), allow_nan=False))
+        judged = {
+            text: {k: summary.get(k) for k in ("nees", "reference")}
+            for text, summary in runs.items()
+            if summary
+        }
+        found = evaluations_json(evaluations) | ({"runs": judged} if judged else {})
+        typer.echo(json.dumps(found, allow_nan=False))
     else:
         say(format_evaluations(evaluations), nl=False)
         _tell_causes(evaluations)
+        _tell_covariances(runs)
     if plot is not None:
         from gvo.viz.plots import plot_trajectories
 
@@ -456,6 +469,16 @@ def _tell_causes(evaluations: Sequence[Evaluation]) -> None:
     for row in evaluations_json(evaluations)["estimates"]:
         for cause in likely_causes(row)[:1]:
             say(f"{row['name']}: Likely cause: {cause}")
+
+
+def _tell_covariances(runs: Mapping[str, Mapping[str, Any]]) -> None:
+    from gvo.io.run_folder.verdict import nees_table, reference_words
+
+    for folder, summary in runs.items():
+        if table := nees_table(summary.get("nees") or {}):
+            say(f"\n{folder}, against its ground truth")
+            say(format_table(table[0], table[1:]), nl=False)
+            say(reference_words(summary.get("reference")))
 
 
 for _each in (batch, live, explain, view):

@@ -18,6 +18,15 @@ SPANS_S = (1, 5)
 """Seconds over which motions are compared."""
 N_DOF = 6
 """Degrees of freedom of a pose and of an edge."""
+TOO_SHORT = "too short to fit"
+"""In place of a reference that too few motions tell of."""
+
+_MIN_MOTIONS = 20.0  # that do not overlap
+# Before any motion: of the rotation in radians, the lever arm in metres, the delay in seconds.
+_PRIOR_SIGMAS = np.array([np.deg2rad(0.6)] * 3 + [0.02] * 3 + [0.01])
+_N_STEPS = 6
+_HUBER_SIGMAS = 3.0
+_SIGMA_OF_MEDIAN = 1.4826  # of a normal distribution: sigma over median deviation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -160,6 +169,103 @@ def consistency(truth: Trajectory, motions: Motions) -> Consistency | None:
     )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Reference:
+    """Where the frame of true poses lies on the frame of an estimate, and their delay.
+
+    Parameters
+    ----------
+    values, sigmas : ndarray of float64, shape (7,)
+        Rotation vector of T_reference_frame in radians, its translation in metres, and by how much
+        the stamps of the reference are late, seconds.
+    """
+
+    values: FloatArray
+    sigmas: FloatArray
+
+    def corrected(self, truth: Trajectory) -> Trajectory:
+        """Return the true poses of the frame of the estimate, with its stamps."""
+        T_reference_frame = se3.exp(np.concatenate([self.values[:3], np.zeros(3)]))
+        T_reference_frame[:3, 3] = self.values[3:6]
+        stamps_ns = truth.stamps_ns - round(1e9 * self.values[6])
+        return replace(truth.transformed(T_reference_frame), stamps_ns=stamps_ns)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return what `summary.json` holds of it."""
+        values, sigmas = (
+            {
+                "rotation_deg": np.rad2deg(each[:3]).tolist(),
+                "lever_m": each[3:6].tolist(),
+                "delay_ms": 1e3 * float(each[6]),
+            }
+            for each in (self.values, self.sigmas)
+        )
+        return values | {"sigmas": sigmas}
+
+
+def fit_reference(truth: Trajectory, motions: Motions) -> Reference | None:
+    """Fit where the reference lies on the frame of motions, and its delay, by Gauss-Newton.
+
+    Errors of motions depend on both. By how much the others are larger than stated is taken for
+    noise of the reference, with the weights of Huber. Motions that overlap count as one.
+
+    Parameters
+    ----------
+    truth : Trajectory
+        Poses of the reference.
+    motions : Motions
+        Over equal spans.
+
+    Returns
+    -------
+    Reference or None
+        None of fewer than 20 motions that do not overlap.
+    """
+    values, sigmas = np.zeros(7), _PRIOR_SIGMAS
+    for _ in range(_N_STEPS):
+        corrected = Reference(values=values, sigmas=sigmas).corrected(truth)
+        found = consistency(corrected, motions)
+        if found is None or np.sum(weights := _shares(found)) < _MIN_MOTIONS:
+            return None
+        spread = _SIGMA_OF_MEDIAN * np.median(np.abs(found.errors), axis=0)
+        more = np.maximum(spread**2 - np.median(found.sigmas, axis=0) ** 2, 0.0)
+        C = found.covariances + np.diag(more)
+        sizes = np.sqrt(se3.mahalanobis(found.errors, C))
+        weights *= _HUBER_SIGMAS / np.maximum(sizes, _HUBER_SIGMAS)
+        J = _derivatives(corrected, found)
+        weighted = np.swapaxes(J, 1, 2) @ np.linalg.inv(C) * weights[:, np.newaxis, np.newaxis]
+        H = np.diag(_PRIOR_SIGMAS**-2) + np.sum(weighted @ J, axis=0)
+        gradient = values / _PRIOR_SIGMAS**2 + np.einsum("nij,nj->i", weighted, found.errors)
+        values = values - np.linalg.solve(H, gradient)
+        sigmas = np.sqrt(np.diag(np.linalg.inv(H)))
+    return Reference(values=values, sigmas=sigmas)
+
+
+def _shares(motions: Motions) -> FloatArray:
+    """Return one over how many motions each overlaps with by half or more, itself too."""
+    half_ns = int(np.median(motions.end_ns - motions.start_ns)) // 2
+    starts_ns = np.sort(motions.start_ns)
+    first = np.searchsorted(starts_ns, motions.start_ns - half_ns)
+    last = np.searchsorted(starts_ns, motions.start_ns + half_ns, side="right")
+    return 1.0 / (last - first)
+
+
+def _derivatives(truth: Trajectory, found: Consistency) -> FloatArray:
+    """Return those of the errors by rotation, lever arm and delay, shape (n, 6, 7)."""
+    Ad = se3.adjoint(se3.invert(found.T_start_end))
+    at_start, at_end = (_velocities(truth, each) for each in (found.start_ns, found.end_ns))
+    by_delay = at_end - (Ad @ at_start[..., np.newaxis])[..., 0]
+    return np.concatenate([np.eye(6) - Ad, by_delay[..., np.newaxis]], axis=2)
+
+
+def _velocities(truth: Trajectory, stamps_ns: IntArray) -> FloatArray:
+    """Return twists per second of interpolated poses, shape (n, 6)."""
+    after = np.clip(np.searchsorted(truth.stamps_ns, stamps_ns), 1, len(truth) - 1)
+    T_a, T_b = truth.T_world_frame[after - 1], truth.T_world_frame[after]
+    seconds = 1e-9 * (truth.stamps_ns[after] - truth.stamps_ns[after - 1])
+    return np.asarray(se3.log(se3.invert(T_a) @ T_b) / seconds[:, np.newaxis])
+
+
 def judged(truth: Trajectory, raw: Trajectory, window: Mapping[int, Motions]) -> dict[str, Any]:
     """Return what `summary.json` holds of covariances compared with the truth.
 
@@ -175,11 +281,17 @@ def judged(truth: Trajectory, raw: Trajectory, window: Mapping[int, Motions]) ->
     Returns
     -------
     dict
-        `nees`, by estimate, span and way: see `Consistency.as_json`.
+        `nees`, by estimate, span and way ("bare", "fitted"): see `Consistency.as_json`;
+        `reference`, fitted to the window's motions over the shortest span, or `TOO_SHORT`.
     """
+    if not truth.has_rotations:
+        return {"reference": None, "nees": {}}
     motions = {"raw": {s: motions_of_chain(raw, s) for s in SPANS_S}, "window": window}
-    ways = {"bare": truth}
+    # The errors of the raw chain are larger, and go with the motion as those of a reference do.
+    reference = fit_reference(truth, window[SPANS_S[0]])
+    ways = {"bare": truth} | ({"fitted": reference.corrected(truth)} if reference else {})
     return {
+        "reference": TOO_SHORT if reference is None else reference.as_json(),
         "nees": {
             name: {
                 f"{span_s}s": {
@@ -190,7 +302,7 @@ def judged(truth: Trajectory, raw: Trajectory, window: Mapping[int, Motions]) ->
                 for span_s, of_span in of_spans.items()
             }
             for name, of_spans in motions.items()
-        }
+        },
     }
 
 

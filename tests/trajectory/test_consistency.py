@@ -7,13 +7,18 @@ import pytest
 
 from gvo.geometry import se3
 from gvo.trajectory.consistency import (
+    TOO_SHORT,
     Consistency,
     Motions,
+    Reference,
     consistency,
+    fit_reference,
+    judged,
     motions_of_chain,
     truth_jump,
 )
 from gvo.trajectory.trajectory import Trajectory
+from gvo.types import FloatArray
 from tests.trajectory.paths import circle, straight, unturned
 
 # Of a step of 0.1 s, at its end.
@@ -151,3 +156,125 @@ def test_the_jump_of_the_truth_needs_three_poses_with_rotations() -> None:
     assert truth_jump(truth, truth.select(slice(2))) is None
     assert truth_jump(truth, truth.select(slice(3))) == pytest.approx(0.0, abs=1e-9)
     assert truth_jump(Trajectory.of_positions(truth.stamps_ns, truth.positions), truth) is None
+
+
+# Of the reference on the frame of the estimate: radians, metres, seconds late.
+PLANTED = np.array([*np.deg2rad([0.5, -0.4, 0.3]), 0.010, -0.015, 0.008, 0.006])
+
+
+def hand(seconds: FloatArray) -> FloatArray:
+    """Return the poses of a hand that turns about and moves along all axes."""
+    phases = np.array([0.0, 1.0, 2.0])
+    turns = 0.4 * np.sin(np.outer(seconds, [1.3, 1.7, 0.9]) + phases)
+    T = se3.exp(np.concatenate([turns, np.zeros_like(turns)], axis=1))
+    T[:, :3, 3] = 0.5 * np.sin(np.outer(seconds, [0.8, 1.1, 1.5]) - phases)
+    return T
+
+
+def referred(
+    seed: int, *, seconds: int = 30, planted: FloatArray = PLANTED
+) -> tuple[Trajectory, Trajectory]:
+    """Return true poses at 100 Hz of a frame off the camera's, and the camera's raw chain."""
+    rng, stamps = np.random.default_rng(seed), np.arange(20 * seconds) / 20.0
+    covariance, T = 1e-6 * np.eye(6), hand(stamps)
+    steps = se3.invert(T[:-1]) @ T[1:] @ se3.exp(rng.normal(scale=1e-3, size=(len(T) - 1, 6)))
+    chain, covariances = [np.eye(4)], [np.zeros((6, 6))]
+    for step in steps:
+        chain.append(chain[-1] @ step)
+        covariances.append(se3.compose_covariance(covariances[-1], step, covariance))
+    raw = Trajectory(
+        stamps_ns=np.round(1e9 * stamps).astype(np.int64),
+        T_world_frame=np.array(chain),
+        covariances=np.array(covariances),
+    )
+    true_stamps = np.arange(-10, 100 * seconds + 10) / 100.0
+    T_reference_cam = se3.exp(np.concatenate([planted[:3], np.zeros(3)]))
+    T_reference_cam[:3, 3] = planted[3:6]
+    truth = Trajectory(
+        stamps_ns=np.round(1e9 * (true_stamps + planted[6])).astype(np.int64),
+        T_world_frame=hand(true_stamps) @ se3.invert(T_reference_cam),
+    )
+    return truth, raw
+
+
+def fitted(truth: Trajectory, motions: Motions) -> Reference:
+    reference = fit_reference(truth, motions)
+    assert reference is not None
+    return reference
+
+
+@pytest.mark.parametrize("planted", [PLANTED, np.zeros(7)])
+def test_the_place_and_the_delay_of_the_reference_are_found_within_sigmas(
+    planted: FloatArray,
+) -> None:
+    offs = []
+    for seed in range(6):
+        truth, raw = referred(seed, planted=planted)
+        found = fitted(truth, motions_of_chain(raw))
+        offs.append((found.values - planted) / found.sigmas)
+        assert np.all(found.sigmas < [*[np.deg2rad(0.15)] * 3, *[0.005] * 3, 0.002])
+    assert np.abs(offs).max() < 4.0
+    assert 0.7 < np.sqrt(np.mean(np.square(offs))) < 1.4
+
+
+def test_motions_that_overlap_count_once() -> None:
+    truth, raw = referred(0)
+    motions = motions_of_chain(raw)
+    whole = fitted(truth, motions)
+    first = np.arange(0, len(raw) - 20, 20)
+    apart = Motions.of_chain(raw, first, first + 20, name="one a second")
+    np.testing.assert_allclose(fitted(truth, apart).sigmas, whole.sigmas, rtol=0.4)
+
+
+def test_motions_are_not_trusted_more_than_they_say() -> None:
+    truth, raw = referred(0)
+    motions = motions_of_chain(raw)
+    doubtful = replace(motions, covariances=100.0 * motions.covariances)
+    ratios = fitted(truth, doubtful).sigmas / fitted(truth, motions).sigmas
+    assert np.all((ratios > 1.5) & (ratios < 11.0))
+
+
+def test_where_the_truth_jumps_the_fit_stays() -> None:
+    truth, raw = referred(0)
+    motions, poses = motions_of_chain(raw), truth.T_world_frame.copy()
+    poses[1500:, :3, 3] += 0.3
+    right, wrong = fitted(truth, motions), fitted(replace(truth, T_world_frame=poses), motions)
+    assert np.all(np.abs(wrong.values - right.values) < 2.0 * right.sigmas)
+
+
+def test_covariances_are_judged_bare_and_fitted() -> None:
+    truth, raw = referred(0)
+    told = judged(truth, raw, {1: motions_of_chain(raw), 5: motions_of_chain(raw, 5)})
+    assert told["nees"]["window"] == told["nees"]["raw"]
+    for span, high in (("1s", 1.3), ("5s", 1.8)):
+        bare, corrected = (told["nees"]["raw"][span][way] for way in ("bare", "fitted"))
+        assert bare["translation"] > 1.3 * corrected["translation"]
+        for key in ("rotation", "translation", "along"):
+            assert 0.3 < corrected[key] < high
+    reference = told["reference"]
+    assert reference["delay_ms"] == pytest.approx(6.0, abs=2.0)
+    assert reference["lever_m"] == pytest.approx(PLANTED[3:6].tolist(), abs=0.006)
+    assert reference["rotation_deg"] == pytest.approx([0.5, -0.4, 0.3], abs=0.2)
+    assert [*reference["sigmas"]] == ["rotation_deg", "lever_m", "delay_ms"]
+
+
+def test_of_an_exact_truth_both_ways_agree() -> None:
+    truth, raw = referred(3, planted=np.zeros(7))
+    ways = judged(truth, raw, {1: motions_of_chain(raw)})["nees"]["window"]["1s"]
+    for key in ("rotation", "translation"):
+        assert ways["fitted"][key] == pytest.approx(ways["bare"][key], rel=0.2)
+
+
+def test_fewer_than_twenty_motions_are_too_few_to_fit_a_reference() -> None:
+    truth, raw = referred(0, seconds=20)
+    told = judged(truth, raw, {1: motions_of_chain(raw)})
+    assert told["reference"] == TOO_SHORT
+    assert [*told["nees"]["raw"]["1s"]] == ["bare"]
+    truth, raw = referred(0, seconds=22)
+    assert fit_reference(truth, motions_of_chain(raw)) is not None
+
+
+def test_a_reference_without_rotations_judges_nothing() -> None:
+    truth, raw = referred(0)
+    points = Trajectory.of_positions(truth.stamps_ns, truth.positions)
+    assert judged(points, raw, {}) == {"reference": None, "nees": {}}

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias, cast, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from gvo._text import read_text, text_lines
+from gvo._text import exists, read_text, text_lines
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
 from gvo.io.run_folder.writer import (
@@ -154,7 +154,7 @@ def read_run(folder: str | Path) -> RunRecord:
     missing = [name for name in needed if not (folder / name).is_file()]
     if missing:
         raise RecordingError(f"{folder}: is not a run folder: {missing[0]} is missing; {_EXPECTED}")
-    summary = _read_summary(folder / "summary.json")
+    summary = read_summary(folder / "summary.json")
     tables = {name: _read_table(folder / f"{name}.csv", _REQUIRED[name]) for name in _REQUIRED}
     return RunRecord(
         folder=folder,
@@ -187,7 +187,16 @@ def read_estimates(folder: Path, *, is_growing: bool = False) -> dict[str, Traje
     return found
 
 
-def _read_summary(path: Path) -> dict[str, Any]:
+def pose_files(path: str) -> list[str]:
+    """Return the trajectories in a run folder; where it is none, the path itself."""
+    folder = Path(path)
+    files = [folder / f"{name}.txt" for name in (*TRAJECTORIES, GLOBAL)]
+    is_run = exists(folder / "frames.csv")
+    return [str(file) for file in files if file.is_file()] if is_run else [path]
+
+
+def read_summary(path: Path) -> dict[str, Any]:
+    """Read `summary.json`; empty where there is none."""
     if not path.is_file():
         return {}
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import hypot
 from typing import Any
 
 from gvo.io.run_folder.writer import GLOBAL
@@ -170,6 +171,22 @@ def nees_table(nees: Mapping[str, Any]) -> list[tuple[str, ...]]:
     ]
     header = ("NEES of motions", "n", "rotation", "translation", "along the way", "by chance")
     return [header, *rows] if rows else []
+
+
+def reference_words(reference: Mapping[str, Any] | str | None) -> str:
+    """Say in a sentence what was fitted of the reference of a summary; empty without one."""
+    if not isinstance(reference, Mapping):
+        return f"The run is {reference} where the reference lies." if reference else ""
+    sigmas, delay_ms = reference["sigmas"], reference["delay_ms"]
+    turned, off = (
+        f"{factor * hypot(*reference[key]):.2g} \u00b1 {factor * max(sigmas[key]):.1g}"
+        for key, factor in (("rotation_deg", 1.0), ("lever_m", 1e3))
+    )
+    when = "late" if delay_ms > 0.0 else "early"
+    return (
+        f"Fitted: the reference is turned by {turned} deg and lies {off} mm off, and it is "
+        f"{abs(delay_ms):.2g} \u00b1 {sigmas['delay_ms']:.1g} ms {when}."
+    )
 
 
 def _looks_at_frames(summary: Mapping[str, Any]) -> list[str]:
