@@ -476,7 +476,8 @@ def _tell_covariances(runs: Mapping[str, Mapping[str, Any]]) -> None:
 
     for folder, summary in runs.items():
         if table := nees_table(summary.get("nees") or {}):
-            say(f"\n{folder}, against its ground truth")
+            say("")
+            say(f"{folder}: motions against its ground truth")
             say(format_table(table[0], table[1:]), nl=False)
             say(reference_words(summary.get("reference")))
 

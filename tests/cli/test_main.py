@@ -144,6 +144,31 @@ def test_compare_agrees_with_the_run(command: Command, room_bag: Path, tmp_path:
     assert set(estimates[0]) >= {"name", "n"} | errors_of
 
 
+def test_compare_of_a_run_folder_tells_of_its_covariances_too(
+    command: Command, room_bag: Path, tmp_path: Path
+) -> None:
+    run, other = tmp_path / "run", tmp_path / "other.txt"
+    command("run", "--no-report", room_bag, "--out", run)
+    other.write_bytes((run / "raw.txt").read_bytes())
+    row = {"rotation": 9.0, "translation": 1.25, "along": 0.5, "n": 40, "low": 0.6, "high": 1.5}
+    summary = json.loads((run / "summary.json").read_text())
+    told = {"nees": {"window": {"1s": {"bare": row}}}, "reference": "too short to fit"}
+    (run / "summary.json").write_text(json.dumps(summary | told))
+    found = json.loads(command("compare", room_bag, run, other, "--json").out)
+    names = ["raw", "causal", "smoothed", "global", "other"]
+    assert [entry["name"] for entry in found["estimates"]] == names
+    assert found["runs"] == {str(run): told}
+    answer = command("compare", room_bag, run)
+    assert f"{run}: motions against its ground truth\n" in answer.out
+    assert re.search(
+        r"window over 1 s, bare +40 +9\.00 +1\.25 +0\.50 +0\.60 to 1\.50\n", answer.out
+    )
+    assert "The run is too short to fit where the reference lies.\n" in answer.out
+    files = [run / f"{name}.txt" for name in names[:-1]]
+    assert command("compare", room_bag, *files).out == answer.out[: answer.out.index(f"\n{run}")]
+    assert "runs" not in json.loads(command("compare", room_bag, other, "--json").out)
+
+
 def test_compare_counts_repeated_rows_and_needs_3_poses(command: Command, tmp_path: Path) -> None:
     rows = [f"{k} {k} 0 0 0 0 0 1\n" for k in range(4)]
     (tmp_path / "truth.txt").write_text("".join(rows))

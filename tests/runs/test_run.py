@@ -69,6 +69,7 @@ def test_summary_tells_the_path_and_how_the_covariances_fit(run_dir: Path) -> No
     assert summary["path_m"] == pytest.approx(truth.distances()[-1], rel=0.01)
     assert summary["extent_m"] == pytest.approx(summary["path_m"], rel=0.1)
     assert 0.0 <= summary["truth_jump_m"] < 1e-3  # it is exact
+    assert summary["reference"] == "too short to fit"
     assert summary["heading_deg"] < 5.0  # the camera looks along the road
     for name, n in (("window", 1), ("raw", 10)):
         assert summary["nees"][name]["5s"] == {}

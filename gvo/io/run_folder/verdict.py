@@ -169,7 +169,7 @@ def nees_table(nees: Mapping[str, Any]) -> list[tuple[str, ...]]:
         for span, ways in spans.items()
         for way, row in ways.items()
     ]
-    header = ("NEES of motions", "n", "rotation", "translation", "along the way", "by chance")
+    header = ("NEES of motions", "n", "rotation", "translation", "along", "by chance")
     return [header, *rows] if rows else []
 
 

@@ -4,7 +4,8 @@ from typing import Any
 
 import pytest
 
-from gvo.io.run_folder.verdict import loop_words, nees_table, verdict
+from gvo.io.run_folder.verdict import loop_words, nees_table, reference_words, verdict
+from gvo.trajectory.consistency import TOO_SHORT
 
 
 def row(nees: float, *, error_m: float = 0.05, **changes: float) -> dict[str, Any]:
@@ -199,6 +200,18 @@ def test_the_table_of_nees_has_a_row_for_each_way() -> None:
         ("window over 1 s, fitted", "40", "1.50", "1.50", "0.25", "0.60 to 1.50"),
     ]
     assert nees_table({}) == []
+
+
+def test_a_sentence_tells_what_was_fitted_of_the_reference() -> None:
+    found = {"rotation_deg": [-1.0, 0.6, 0.2], "lever_m": [0.003, 0.0, 0.004], "delay_ms": -4.31}
+    sigmas = {"rotation_deg": [0.1, 0.2, 0.1], "lever_m": [0.001, 0.002, 0.001], "delay_ms": 0.62}
+    assert reference_words(found | {"sigmas": sigmas}) == (
+        "Fitted: the reference is turned by 1.2 \u00b1 0.2 deg and lies 5 \u00b1 2 mm off, and it "
+        "is 4.3 \u00b1 0.6 ms early."
+    )
+    assert reference_words(found | {"delay_ms": 4.31, "sigmas": sigmas}).endswith("ms late.")
+    assert reference_words(TOO_SHORT) == "The run is too short to fit where the reference lies."
+    assert reference_words(None) == ""
 
 
 ANEW = ": calibrate anew"

@@ -52,6 +52,21 @@ def page_of(folder: Path) -> str:
     return path.read_text(encoding="utf-8")
 
 
+def test_covariances_are_shown_both_ways_with_the_reference(copy: Path) -> None:
+    row = {"rotation": 9.0, "translation": 1.25, "along": 0.5, "n": 40, "low": 0.6, "high": 1.5}
+    sigmas = {"rotation_deg": [0.1] * 3, "lever_m": [0.001] * 3, "delay_ms": 0.6}
+    reference = {"rotation_deg": [1.2, 0.0, 0.0], "lever_m": [0.0] * 3, "delay_ms": 4.0}
+    ways = {"bare": row, "fitted": row | {"rotation": 2.0, "error_m": 0.01, "error_deg": 0.1}}
+    nees = {"raw": {"1s": ways}, "window": {"1s": {}}}
+    rewrite_summary(copy, nees=nees, reference=reference | {"sigmas": sigmas})
+    text = page_of(copy)
+    shown = re.findall(r"<td[^>]*>([^<]*)", text)
+    start, rest = shown.index("raw over 1 s, bare"), ["1.25", "0.50", "0.60 to 1.50"]
+    assert shown[start + 1 : start + 6] == ["40", "9.00", *rest]
+    assert shown[start + 6 : start + 12] == ["raw over 1 s, fitted", "40", "2.00", *rest]
+    assert "Fitted: the reference is turned by 1.2 \u00b1 0.1 deg" in text
+
+
 def test_each_section_is_there_and_drawn_and_nothing_outside_referred_to(page: Path) -> None:
     content = Page(page.read_text())
     assert [name for name in content.ids if name in SECTIONS] == SECTIONS
