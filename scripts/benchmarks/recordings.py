@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import gvo
 from gvo.io.recording import Sensor, Source
+from gvo.io.synthetic import RigError
 from gvo.types import Frame
 
 sys.path.append(str(Path(__file__).parents[2]))  # for the worlds of the tests
@@ -50,6 +51,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--frames", type=at_least(2), metavar="N", help="default: the kind's")
     group.add_argument("--scale", type=float, metavar="S", help="of the images")
     group.add_argument("--readout", type=float, default=0.0, metavar="MS", help="rolling shutter")
+    group.add_argument("--bent", type=float, default=0.0, metavar="PX", help="error of the rig")
+    group.add_argument(
+        "--others", action="store_true", help="of constants that none considers, too"
+    )
     group.add_argument("--keep", type=Path, metavar="DIR", help="of bags, written once, then read")
 
 
@@ -91,14 +96,17 @@ def of_seed(arguments: argparse.Namespace, seed: int) -> Source:
     def render() -> Source:
         options = {"n_frames": n_frames, "scale": scale, "readout_ms": readout_ms, "seed": seed}
         try:
-            return rendered(kind.world, sensor, **options)
+            bent = RigError(size_px=arguments.bent, seed=seed, others=arguments.others)
+            return rendered(kind.world, sensor, **options, rig_error=bent)
         except ValueError as error:
             raise gvo.GvoError(f"{arguments.kind}: {error}") from error
 
     if arguments.keep is None:
         return render()
-    name = f"{arguments.kind}-{sensor}-{n_frames}-{scale:g}x-{readout_ms:g}ms-{seed}.mcap"
-    path: Path = arguments.keep / name
+    name = f"{arguments.kind}-{sensor}-{n_frames}-{scale:g}x-{readout_ms:g}ms-{seed}"
+    if arguments.bent:
+        name += f"-bent-{arguments.bent:g}px" + "-others" * arguments.others
+    path: Path = arguments.keep / f"{name}.mcap"
     if not path.exists():
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
