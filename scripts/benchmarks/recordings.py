@@ -52,9 +52,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--scale", type=float, metavar="S", help="of the images")
     group.add_argument("--readout", type=float, default=0.0, metavar="MS", help="rolling shutter")
     group.add_argument("--bent", type=float, default=0.0, metavar="PX", help="error of the rig")
-    group.add_argument(
-        "--others", action="store_true", help="of constants that none considers, too"
-    )
+    group.add_argument("--others", action="store_true", help="also of what is not considered")
     group.add_argument("--keep", type=Path, metavar="DIR", help="of bags, written once, then read")
 
 
@@ -96,8 +94,10 @@ def of_seed(arguments: argparse.Namespace, seed: int) -> Source:
     def render() -> Source:
         options = {"n_frames": n_frames, "scale": scale, "readout_ms": readout_ms, "seed": seed}
         try:
-            bent = RigError(size_px=arguments.bent, seed=seed, others=arguments.others)
-            return rendered(kind.world, sensor, **options, rig_error=bent)
+            if size_px := arguments.bent:
+                bent = RigError(size_px=size_px, seed=seed, others=arguments.others)
+                return rendered(kind.world, sensor, **options, rig_error=bent)
+            return rendered(kind.world, sensor, **options)
         except ValueError as error:
             raise gvo.GvoError(f"{arguments.kind}: {error}") from error
 
