@@ -98,7 +98,7 @@ class RunLoop:
         self._previous_ns: int | None = None
         self._outputs: list[Output] = []
         self.edges: dict[int, list[tuple[int, Edge]]] = {span_s: [] for span_s in SPANS_S}
-        self._asked_ns = dict[int, int]()
+        self._given_ns = dict[int, int]()
         self.output_faults: list[str] = []
         self.waited_s: Callable[[], float] = lambda: 0.0
         self.on_tracked: Callable[[Frame | FaultyFrame, FrameResult | None], None] | None = None
@@ -262,14 +262,14 @@ class RunLoop:
                     output.discard()
 
     def _ask_window(self, stamp_ns: int) -> None:
-        """Once per span, keep the motion over it as the window has it."""
+        """Once per span, keep the motion over it as the window has it, as soon as it has one."""
         for span_s, edges in self.edges.items():
             span_ns = span_s * 10**9
-            if stamp_ns - self._asked_ns.setdefault(span_s, stamp_ns) < span_ns:
+            if stamp_ns - self._given_ns.setdefault(span_s, stamp_ns) < span_ns:
                 continue
-            self._asked_ns[span_s] = stamp_ns
             edge = edge_over(self._odometry.window, stamp_ns, span_ns)
             if edge is not None:
+                self._given_ns[span_s] = stamp_ns
                 edges.append((stamp_ns, self.base_frame.apply_to_edge(stamp_ns, edge)))
 
     def _take_faulty(self, item: FaultyFrame) -> None:

@@ -9,7 +9,8 @@ on and with `ransac.seed` 100 + k, a row each, then the median and the worst.
 t_err and r_err are those over KITTI's segments, where the path is long enough for them. The NEES,
 e^T C^-1 e per degree of freedom, rotation / translation, is one on average where covariances C
 fit the errors e; above one they promise too much. It is taken of the raw chain over 1 s and 5 s,
-and of the window between its newest pose and the one about so much older, where it holds one.
+and of the window between its newest pose and the one about so much older, where it holds one. Named
+recordings that are long enough have a second row: against the truth brought to where it fits best.
 
 Example: python scripts/benchmark.py errors kitti_06_start euroc_mh01_start
 Example: python scripts/benchmark.py errors --kind rest --seeds 10 --keep rendered
@@ -24,13 +25,18 @@ import numpy as np
 import gvo
 from gvo.io.recording import Source
 from gvo.runs.loop import edge_over, motions_of_window
-from gvo.trajectory.consistency import Motions, consistency, motions_of_chain
+from gvo.trajectory.consistency import (
+    SPANS_S,
+    Motions,
+    consistency,
+    fit_reference,
+    motions_of_chain,
+)
 from gvo.types import Edge
 
 from . import recordings
 from .tables import Table, median_and_worst, number
 
-SPANS_S = (1, 5)
 NEES_HEADER = tuple(
     f"NEES {name} {span} s".rjust(15) for name in ("raw", "window") for span in SPANS_S
 )
@@ -54,10 +60,14 @@ SEED_HEADER = (
 
 
 class Measured(NamedTuple):
-    """The errors of raw, causal and smoothed; the mean NEES of rotation and translation, n x 2."""
+    """Errors of raw, causal and smoothed; mean NEES of rotation and translation, n x 2.
+
+    Those are against the truth as it is; fitted, if there are any, once its place and delay are.
+    """
 
     evaluations: dict[str, gvo.Evaluation]
     nees: list[tuple[float, float]]
+    fitted: list[tuple[float, float]]
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -115,16 +125,18 @@ def errors_of(source: Source, settings: Sequence[str], *, first: int = 0) -> Mea
             if edge is not None:
                 edges.append((result.stamp_ns, edge))
     trajectories = run.trajectories()
-    motions = [
-        *(motions_of_chain(trajectories["raw"], span_s) for span_s in SPANS_S),
-        *(motions_of_window(edges, name="window") for edges in in_window.values()),
-    ]
+    of_window = [motions_of_window(edges, name="window") for edges in in_window.values()]
+    of_chain = [motions_of_chain(trajectories["raw"], span_s) for span_s in SPANS_S]
+    motions, reference = [*of_chain, *of_window], fit_reference(truth, of_window[0])
     segments = {"segments": [20.0, 50.0], "segment_step": 1}
     return Measured(
         evaluations={
             name: gvo.evaluate(truth, t, name=name, **segments) for name, t in trajectories.items()
         },
         nees=[mean_nees(truth, each) for each in motions],
+        fitted=[
+            mean_nees(reference.corrected(truth), each) for each in motions if reference is not None
+        ],
     )
 
 
@@ -137,14 +149,15 @@ def mean_nees(truth: gvo.Trajectory, motions: Motions) -> tuple[float, float]:
 def print_recordings(sources: Sequence[Source], settings: Sequence[str]) -> None:
     """Print a row of errors for each recording, then a row of NEES."""
     names = [source.info.name for source in sources]
-    table, nees = Table(RECORDING_HEADER, names), []
+    table, nees = Table(RECORDING_HEADER, names), dict[str, list[tuple[float, float]]]()
     for name, source in zip(names, sources, strict=True):
         measured = errors_of(source, settings)
-        nees.append(measured.nees)
+        nees |= {name: measured.nees, f"{name}, fitted": measured.fitted}
         table.add([name, *error_cells(measured.evaluations)])
-    table = Table(("recording", *NEES_HEADER), names)
-    for name, pairs in zip(names, nees, strict=True):
-        table.add([name, *nees_cells(pairs)])
+    table = Table(("recording", *NEES_HEADER), [*nees])
+    for name, pairs in nees.items():
+        if pairs:
+            table.add([name, *nees_cells(pairs)])
 
 
 def error_cells(evaluations: dict[str, gvo.Evaluation]) -> list[str]:
