@@ -179,13 +179,13 @@ def reference_words(reference: Mapping[str, Any] | str | None) -> str:
         return f"The run is {reference} where the reference lies." if reference else ""
     sigmas, delay_ms = reference["sigmas"], reference["delay_ms"]
     turned, off = (
-        f"{factor * hypot(*reference[key]):.2g} \u00b1 {factor * max(sigmas[key]):.1g}"
+        f"{factor * hypot(*reference[key]):.2g} \u00b1 {factor * max(sigmas[key]):.2g}"
         for key, factor in (("rotation_deg", 1.0), ("lever_m", 1e3))
     )
     when = "late" if delay_ms > 0.0 else "early"
     return (
         f"Fitted: the reference is turned by {turned} deg and lies {off} mm off, and it is "
-        f"{abs(delay_ms):.2g} \u00b1 {sigmas['delay_ms']:.1g} ms {when}."
+        f"{abs(delay_ms):.2g} \u00b1 {sigmas['delay_ms']:.2g} ms {when}."
     )
 
 

@@ -207,7 +207,7 @@ def test_a_sentence_tells_what_was_fitted_of_the_reference() -> None:
     sigmas = {"rotation_deg": [0.1, 0.2, 0.1], "lever_m": [0.001, 0.002, 0.001], "delay_ms": 0.62}
     assert reference_words(found | {"sigmas": sigmas}) == (
         "Fitted: the reference is turned by 1.2 \u00b1 0.2 deg and lies 5 \u00b1 2 mm off, and it "
-        "is 4.3 \u00b1 0.6 ms early."
+        "is 4.3 \u00b1 0.62 ms early."
     )
     assert reference_words(found | {"delay_ms": 4.31, "sigmas": sigmas}).endswith("ms late.")
     assert reference_words(TOO_SHORT) == "The run is too short to fit where the reference lies."
