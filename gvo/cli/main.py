@@ -8,6 +8,7 @@ import sys
 import time
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -15,7 +16,7 @@ import typer
 from typer import Argument, Option
 from typer.main import get_command
 
-from gvo._text import exists, format_table, plain_floats, plain_number
+from gvo._text import format_table, plain_floats, plain_number
 from gvo._version import __version__
 from gvo.cli import options as opt
 from gvo.cli.batch import batch
@@ -309,9 +310,7 @@ def compare(
         str,
         Argument(help="Pose file, recording with truth, BAG#tf:PARENT:CHILD or BAG#TOPIC."),
     ],
-    estimates: Annotated[
-        list[str], Argument(help="Pose files, run folders, BAG#tf:... or BAG#TOPIC.")
-    ],
+    estimates: Annotated[list[str], Argument(help="Pose files, runs, BAG#tf:... or BAG#TOPIC.")],
     align: Annotated[
         _Align, Option(metavar="HOW", help="Alignment: none, origin, se3, or sim3 with a scale.")
     ] = "se3",
@@ -339,7 +338,6 @@ def compare(
     from gvo.io.poses.inputs import read_compared
     from gvo.io.run_folder.line_file import check_new
     from gvo.io.run_folder.reader import pose_files, read_summary
-    from gvo.io.run_folder.writer import SUMMARY
     from gvo.trajectory.evaluation import evaluate, evaluations_json, format_evaluations
     from gvo.viz.names import PAGES, check_suffix
 
@@ -348,9 +346,9 @@ def compare(
             check_new(path, otherwise="--force to replace it")
     check_suffix(plot)
     check_suffix(report_file, PAGES)
-    runs = {text: read_summary(Path(text) / SUMMARY) for text in estimates if exists(Path(text))}
-    files = [file for text in estimates for file in pose_files(text)]
-    truth, trajectories, notes = read_compared(reference, files)
+    files = {text: pose_files(text) for text in estimates}
+    runs = {text: read_summary(Path(text)) for text, each in files.items() if each != [text]}
+    truth, trajectories, notes = read_compared(reference, [*chain(*files.values())])
     warn(notes)
     trajectories = {
         name: _by_clock(truth, each, name, offset) for name, each in trajectories.items()
@@ -363,12 +361,7 @@ def compare(
         for name, each in trajectories.items()
     ]
     if as_json:
-        judged = {
-            text: {k: summary.get(k) for k in ("nees", "reference")}
-            for text, summary in runs.items()
-            if summary
-        }
-        found = evaluations_json(evaluations) | ({"runs": judged} if judged else {})
+        found = evaluations_json(evaluations) | ({"runs": runs} if runs else {})
         typer.echo(json.dumps(found, allow_nan=False))
     else:
         say(format_evaluations(evaluations), nl=False)
@@ -475,10 +468,10 @@ def _tell_covariances(runs: Mapping[str, Mapping[str, Any]]) -> None:
     from gvo.io.run_folder.verdict import nees_table, reference_words
 
     for folder, summary in runs.items():
-        if table := nees_table(summary.get("nees") or {}):
-            say("")
-            say(f"{folder}: motions against its ground truth")
-            say(format_table(table[0], table[1:]), nl=False)
+        header, *rows = nees_table(summary.get("nees") or {})
+        if rows:
+            title = f"\n{folder}: motions against its ground truth\n"
+            say(title + format_table(header, rows), nl=False)
             say(reference_words(summary.get("reference")))
 
 

@@ -267,8 +267,7 @@ class RunLoop:
             span_ns = span_s * 10**9
             if stamp_ns - self._given_ns.setdefault(span_s, stamp_ns) < span_ns:
                 continue
-            edge = edge_over(self._odometry.window, stamp_ns, span_ns)
-            if edge is not None:
+            if (edge := edge_over(self._odometry.window, stamp_ns, span_ns)) is not None:
                 self._given_ns[span_s] = stamp_ns
                 edges.append((stamp_ns, self.base_frame.apply_to_edge(stamp_ns, edge)))
 
@@ -329,17 +328,15 @@ def edge_over(window: SlidingWindow, stamp_ns: int, span_ns: int) -> Edge | None
     return window.relative_pose(start, stamp_ns)
 
 
-def motions_of_window(edges: Sequence[tuple[int, Edge]], *, name: str) -> Motions:
+def motions_of_window(edges: Sequence[tuple[int, Edge]]) -> Motions:
     """Return edges as motions, to be compared with the true ones.
 
     Parameters
     ----------
     edges : sequence of (int, Edge)
         Stamps and edges, as `RunLoop.edges` of one span.
-    name : str
     """
     return Motions(
-        name=name,
         start_ns=np.array([edge.reference_id for _, edge in edges], dtype=np.int64),
         end_ns=np.array([stamp_ns for stamp_ns, _ in edges], dtype=np.int64),
         T_start_end=np.array([edge.T_reference_frame for _, edge in edges]).reshape(-1, 4, 4),

@@ -34,7 +34,7 @@ from gvo.trajectory.consistency import judged
 from gvo.trajectory.evaluation import Evaluation
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Failure, Optimum, Progress
+from gvo.types import Failure, FloatArray, Optimum, Progress
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -219,29 +219,26 @@ def _measure(
 ) -> dict[str, Any]:
     """Return path length, extent, and how the covariances fit the truth, if there is one."""
     smoothed = read_trajectory(folder.path / "smoothed.txt")
+    T_base_cam = loop.base_frame.T_base_cam(int(smoothed.stamps_ns[0]))
     found = {
         "path_m": float(smoothed.distances()[-1]),
         "extent_m": float(np.linalg.norm(np.ptp(smoothed.positions, axis=0))),
-        "heading_deg": _heading_deg(smoothed, loop.base_frame),
+        "heading_deg": _heading_deg(smoothed, T_base_cam[:3, 2]),
     }
     if not isinstance(compared, TruthComparison):
         return found | {"truth_jump_m": None, "nees": {}, "reference": None}
-    window = {
-        span_s: motions_of_window(edges, name=f"window over {span_s} s")
-        for span_s, edges in loop.edges.items()
-    }
-    found |= judged(compared.truth.trajectory, compared.estimates["raw"], window)
-    return found | {"truth_jump_m": compared.truth_jump_m}
+    window = {span_s: motions_of_window(edges) for span_s, edges in loop.edges.items()}
+    return found | judged(compared.truth.trajectory, compared.estimates["raw"], window)
 
 
-def _heading_deg(trajectory: Trajectory, base_frame: BaseFrame) -> float | None:
-    """Return the angle between the way and the optical axis, forward or back, in the mean."""
-    if base_frame.first_stamp_ns is None or not (path_m := trajectory.distances()[-1]):
-        return None
-    axis = base_frame.T_base_cam(base_frame.first_stamp_ns)[:3, 2]
-    axes = trajectory.T_world_frame[:-1, :3, :3] @ axis
-    ahead_m = np.abs(np.sum(axes * np.diff(trajectory.positions, axis=0), axis=1)).sum()
-    return float(np.rad2deg(np.arccos(min(ahead_m / path_m, 1.0))))
+def _heading_deg(trajectory: Trajectory, axis: FloatArray) -> float:
+    """Return the angle between the way and an axis of the frame, forward or back, in the mean."""
+    axes, steps = (
+        trajectory.T_world_frame[:-1, :3, :3] @ axis,
+        np.diff(trajectory.positions, axis=0),
+    )
+    share = np.abs(np.sum(axes * steps, axis=1)).sum() / max(trajectory.distances()[-1], 1e-9)
+    return float(np.rad2deg(np.arccos(min(share, 1.0))))
 
 
 def _compare(truth: Truth | Failure, folder: RunFolder, loop: RunLoop) -> TruthComparison | Failure:

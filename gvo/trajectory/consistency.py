@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import gammaincinv
@@ -18,14 +18,11 @@ SPANS_S = (1, 5)
 """Seconds over which motions are compared."""
 N_DOF = 6
 """Degrees of freedom of a pose and of an edge."""
-TOO_SHORT = "too short to fit"
-"""In place of a reference that too few motions tell of."""
 
 _MIN_MOTIONS = 20.0  # that do not overlap
 # Before any motion: of the rotation in radians, the lever arm in metres, the delay in seconds.
 _PRIOR_SIGMAS = np.array([np.deg2rad(0.6)] * 3 + [0.02] * 3 + [0.01])
-_N_STEPS = 6
-_HUBER_SIGMAS = 3.0
+_N_STEPS, _HUBER_SIGMAS = 6, 3.0
 _SIGMA_OF_MEDIAN = 1.4826  # of a normal distribution: sigma over median deviation
 
 
@@ -35,8 +32,6 @@ class Motions:
 
     Parameters
     ----------
-    name : str
-        Whose they are, and over what.
     start_ns, end_ns : ndarray of int64, shape (n,)
         Stamps of the two poses, nanoseconds.
     T_start_end : ndarray of float64, shape (n, 4, 4)
@@ -45,43 +40,26 @@ class Motions:
         Of (rx, ry, rz, tx, ty, tz), right perturbations, at the end.
     """
 
-    name: str
     start_ns: IntArray
     end_ns: IntArray
     T_start_end: FloatArray
     covariances: FloatArray
 
-    @classmethod
-    def of_chain(cls, chain: Trajectory, first: IntArray, last: IntArray, *, name: str) -> Motions:
-        """Return the motions between poses of a chain with covariances: only there they subtract.
-
-        Parameters
-        ----------
-        chain : Trajectory
-            Each pose is the one before, moved by an independent measurement.
-        first, last : ndarray of int64, shape (n,)
-            Indices.
-        name : str
-        """
-        if chain.covariances is None:
-            chain = replace(chain, covariances=np.zeros((len(chain), 6, 6)))
-        T_start_end, covariances = chain.motions(first, last)
-        return cls(
-            name=name,
-            start_ns=chain.stamps_ns[first],
-            end_ns=chain.stamps_ns[last],
-            T_start_end=T_start_end,
-            covariances=covariances,
-        )
-
 
 def motions_of_chain(chain: Trajectory, span_s: float = SPANS_S[0]) -> Motions:
-    """Return the motions of a raw chain over a span, from each of its poses on."""
+    """Return the motions of a raw chain over a span, from each of its poses on.
+
+    Without covariances of its poses those of the motions are zeros.
+    """
+    if chain.covariances is None:
+        chain = replace(chain, covariances=np.zeros((len(chain), 6, 6)))
     stamps_ns, span_ns = chain.stamps_ns, round(1e9 * span_s)
     last = np.searchsorted(stamps_ns, stamps_ns + span_ns)
     first = np.flatnonzero(last < len(chain))
     first = first[stamps_ns[last[first]] - stamps_ns[first] <= 1.5 * span_ns]
-    return Motions.of_chain(chain, first, last[first], name=f"raw over {span_s} s")
+    start_ns, end_ns = stamps_ns[first], stamps_ns[last[first]]
+    T, covariances = chain.motions(first, last[first])
+    return Motions(start_ns=start_ns, end_ns=end_ns, T_start_end=T, covariances=covariances)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -121,10 +99,8 @@ class Consistency(Motions):
         `low` and `high` bound 95 % of what chance makes of consistent covariances.
         """
         rotation, translation, along = self.mean_nees()
-        span_ns = np.median(self.end_ns - self.start_ns)
         # Motions that overlap share their errors.
-        n_apart = max(1, int((self.end_ns.max() - self.start_ns.min()) // span_ns))
-        n_dof = N_DOF * min(n_apart, len(self.errors))
+        n_dof = N_DOF * max(1.0, float(np.sum(_shares(self))))
         return {
             "rotation": rotation,
             "translation": translation,
@@ -160,7 +136,6 @@ def consistency(truth: Trajectory, motions: Motions) -> Consistency | None:
     T_a, T_b = (true.T_world_frame[np.searchsorted(true.stamps_ns, s)] for s in (start_ns, end_ns))
     T_start_end = motions.T_start_end[are_known]
     return Consistency(
-        name=motions.name,
         start_ns=start_ns,
         end_ns=end_ns,
         T_start_end=T_start_end,
@@ -169,8 +144,7 @@ def consistency(truth: Trajectory, motions: Motions) -> Consistency | None:
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Reference:
+class Reference(NamedTuple):
     """Where the frame of true poses lies on the frame of an estimate, and their delay.
 
     Parameters
@@ -192,13 +166,10 @@ class Reference:
 
     def as_json(self) -> dict[str, Any]:
         """Return what `summary.json` holds of it."""
+        to_units = np.repeat([np.rad2deg(1.0), 1.0, 1e3], [3, 3, 1])
         values, sigmas = (
-            {
-                "rotation_deg": np.rad2deg(each[:3]).tolist(),
-                "lever_m": each[3:6].tolist(),
-                "delay_ms": 1e3 * float(each[6]),
-            }
-            for each in (self.values, self.sigmas)
+            {"rotation_deg": each[:3], "lever_m": each[3:6], "delay_ms": each[6]}
+            for each in ((to_units * self.values).tolist(), (to_units * self.sigmas).tolist())
         )
         return values | {"sigmas": sigmas}
 
@@ -223,7 +194,7 @@ def fit_reference(truth: Trajectory, motions: Motions) -> Reference | None:
     """
     values, sigmas = np.zeros(7), _PRIOR_SIGMAS
     for _ in range(_N_STEPS):
-        corrected = Reference(values=values, sigmas=sigmas).corrected(truth)
+        corrected = Reference(values, sigmas).corrected(truth)
         found = consistency(corrected, motions)
         if found is None or np.sum(weights := _shares(found)) < _MIN_MOTIONS:
             return None
@@ -238,7 +209,7 @@ def fit_reference(truth: Trajectory, motions: Motions) -> Reference | None:
         gradient = values / _PRIOR_SIGMAS**2 + np.einsum("nij,nj->i", weighted, found.errors)
         values = values - np.linalg.solve(H, gradient)
         sigmas = np.sqrt(np.diag(np.linalg.inv(H)))
-    return Reference(values=values, sigmas=sigmas)
+    return Reference(values, sigmas)
 
 
 def _shares(motions: Motions) -> FloatArray:
@@ -246,7 +217,7 @@ def _shares(motions: Motions) -> FloatArray:
     half_ns = int(np.median(motions.end_ns - motions.start_ns)) // 2
     starts_ns = np.sort(motions.start_ns)
     first = np.searchsorted(starts_ns, motions.start_ns - half_ns)
-    last = np.searchsorted(starts_ns, motions.start_ns + half_ns, side="right")
+    last = np.searchsorted(starts_ns, motions.start_ns + half_ns)
     return 1.0 / (last - first)
 
 
@@ -282,28 +253,24 @@ def judged(truth: Trajectory, raw: Trajectory, window: Mapping[int, Motions]) ->
     -------
     dict
         `nees`, by estimate, span and way ("bare", "fitted"): see `Consistency.as_json`;
-        `reference`, fitted to the window's motions over the shortest span, or `TOO_SHORT`.
+        `reference`, fitted to the window's motions over the shortest span, or "too short to fit";
+        `truth_jump_m`.
     """
+    found: dict[str, Any] = {"truth_jump_m": truth_jump(truth, raw), "reference": None, "nees": {}}
     if not truth.has_rotations:
-        return {"reference": None, "nees": {}}
-    motions = {"raw": {s: motions_of_chain(raw, s) for s in SPANS_S}, "window": window}
+        return found
     # The errors of the raw chain are larger, and go with the motion as those of a reference do.
-    reference = fit_reference(truth, window[SPANS_S[0]])
-    ways = {"bare": truth} | ({"fitted": reference.corrected(truth)} if reference else {})
-    return {
-        "reference": TOO_SHORT if reference is None else reference.as_json(),
-        "nees": {
-            name: {
-                f"{span_s}s": {
-                    way: found.as_json()
-                    for way, each in ways.items()
-                    if (found := consistency(each, of_span)) is not None
-                }
-                for span_s, of_span in of_spans.items()
-            }
-            for name, of_spans in motions.items()
-        },
-    }
+    reference, ways = fit_reference(truth, window[SPANS_S[0]]), {"bare": truth}
+    found["reference"] = "too short to fit"
+    if reference is not None:
+        found["reference"], ways["fitted"] = reference.as_json(), reference.corrected(truth)
+    of_chain = {span_s: motions_of_chain(raw, span_s) for span_s in SPANS_S}
+    for name, of_spans in {"raw": of_chain, "window": window}.items():
+        found["nees"][name] = of_name = {}
+        for span_s, motions in of_spans.items():
+            rows = {way: consistency(each, motions) for way, each in ways.items()}
+            of_name[f"{span_s}s"] = {way: row.as_json() for way, row in rows.items() if row}
+    return found
 
 
 def truth_jump(truth: Trajectory, estimate: Trajectory) -> float | None:
@@ -338,7 +305,7 @@ def _is_positive(covariances: FloatArray) -> BoolArray:
     return np.asarray(np.all(variances > 0.0, axis=1) & (smallest > 1e-12))
 
 
-def chi2_bound(share: float, n_dof: int = N_DOF) -> float:
+def chi2_bound(share: float, n_dof: float = N_DOF) -> float:
     """Return a quantile of chi-square, by default with 6 degrees of freedom.
 
     Examples

@@ -125,7 +125,7 @@ def errors_of(source: Source, settings: Sequence[str], *, first: int = 0) -> Mea
             if edge is not None:
                 edges.append((result.stamp_ns, edge))
     trajectories = run.trajectories()
-    of_window = [motions_of_window(edges, name="window") for edges in in_window.values()]
+    of_window = [motions_of_window(edges) for edges in in_window.values()]
     of_chain = [motions_of_chain(trajectories["raw"], span_s) for span_s in SPANS_S]
     motions, reference = [*of_chain, *of_window], fit_reference(truth, of_window[0])
     segments = {"segments": [20.0, 50.0], "segment_step": 1}

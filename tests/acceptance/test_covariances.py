@@ -64,7 +64,7 @@ class Run:
         """Return mean NEES: (raw over 1 s, over 5 s, window over 1 s, over 5 s; turn, shift)."""
         truth, raw = self.recording.ground_truth(), Trajectory.of(self.raw)
         motions = [motions_of_chain(raw, span_s) for span_s in SPANS_S]
-        motions += [motions_of_window(self.edges[span_s], name="window") for span_s in SPANS_S]
+        motions += [motions_of_window(self.edges[span_s]) for span_s in SPANS_S]
         found = [consistency(truth, each) for each in motions]
         return np.array([each.mean_nees()[:2] for each in found if each is not None])
 

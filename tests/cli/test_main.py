@@ -157,7 +157,7 @@ def test_compare_of_a_run_folder_tells_of_its_covariances_too(
     found = json.loads(command("compare", room_bag, run, other, "--json").out)
     names = ["raw", "causal", "smoothed", "global", "other"]
     assert [entry["name"] for entry in found["estimates"]] == names
-    assert found["runs"] == {str(run): told}
+    assert found["runs"] == {str(run): summary | told}
     answer = command("compare", room_bag, run)
     assert f"{run}: motions against its ground truth\n" in answer.out
     assert re.search(

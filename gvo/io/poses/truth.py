@@ -19,7 +19,6 @@ from gvo.io.bag.reader import MessageReader
 from gvo.io.bag.topics import Topic
 from gvo.io.edges.events import InputFaults
 from gvo.io.poses.tf import TfBuffer, read_tf
-from gvo.trajectory.consistency import truth_jump
 from gvo.trajectory.evaluation import Evaluation, evaluate
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import BoolArray, Failure, FloatArray, IntArray
@@ -386,11 +385,6 @@ class TruthComparison:
             evaluate(truth.trajectory, estimate, name=name) for name, estimate in comparable.items()
         )
         return cls(truth=truth, estimates=comparable, evaluations=evaluations)
-
-    @property
-    def truth_jump_m(self) -> float | None:
-        """By how much the truth jumps from frame to frame, metres; see `truth_jump`."""
-        return truth_jump(self.truth.trajectory, self.estimates["smoothed"])
 
     def warnings(self) -> list[str]:
         """Return caveats of the errors, a line each."""

@@ -154,7 +154,7 @@ def read_run(folder: str | Path) -> RunRecord:
     missing = [name for name in needed if not (folder / name).is_file()]
     if missing:
         raise RecordingError(f"{folder}: is not a run folder: {missing[0]} is missing; {_EXPECTED}")
-    summary = read_summary(folder / "summary.json")
+    summary = read_summary(folder)
     tables = {name: _read_table(folder / f"{name}.csv", _REQUIRED[name]) for name in _REQUIRED}
     return RunRecord(
         folder=folder,
@@ -195,8 +195,9 @@ def pose_files(path: str) -> list[str]:
     return [str(file) for file in files if file.is_file()] if is_run else [path]
 
 
-def read_summary(path: Path) -> dict[str, Any]:
-    """Read `summary.json`; empty where there is none."""
+def read_summary(folder: Path) -> dict[str, Any]:
+    """Read the summary in a run folder; empty where there is none."""
+    path = folder / "summary.json"
     if not path.is_file():
         return {}
     try:

@@ -127,50 +127,41 @@ def loop_words(summary: Mapping[str, Any]) -> str:
 
 
 def _how_sure(summary: Mapping[str, Any]) -> str:
-    found = summary.get("nees") or {}
-    of_second = (found.get(name, {}).get("1s") for name in ("window", "raw"))
-    ways: Mapping[str, Any] = next(filter(None, of_second), {})
-    if not ways:
+    found = [spans["1s"] for spans in (summary.get("nees") or {}).values() if spans.get("1s")]
+    if not found:
         return ""
+    ways = found[-1]  # of the window, else of the raw chain
     row = ways.get("fitted") or ways["bare"]
-    heading_deg, path_m = summary.get("heading_deg"), summary.get("path_m") or 0.0
-    if heading_deg is None or heading_deg > _HEADING_DEG or path_m <= _DRIVE_M:
-        nees, rest = 0.5 * (row["rotation"] + row["translation"]), ""
-    else:
+    if summary.get("heading_deg", 90.0) <= _HEADING_DEG and summary["path_m"] > _DRIVE_M:
         nees = 0.75 * row["rotation"] + 0.25 * row["along"]
         rest = "; across the way the reference cannot tell"
-    return _fit_words(nees, row, summary.get("truth_jump_m") or 0.0, "fitted" in ways) + rest
-
-
-def _fit_words(nees: float, row: Mapping[str, Any], jump_m: float, is_fitted: bool) -> str:
-    factor = nees**0.5
+    else:
+        nees, rest = 0.5 * (row["rotation"] + row["translation"]), ""
+    factor, jump_m = nees**0.5, summary.get("truth_jump_m") or 0.0
     if factor < 1.0 / _FIT_FACTOR and nees < row["low"]:
-        return f"are too large, {1.0 / factor:.2g} times in sigma"
+        return f"are too large, {1.0 / factor:.2g} times in sigma{rest}"
     if factor <= _FIT_FACTOR or nees <= row["high"]:
-        return "fit"
+        return f"fit{rest}"
     # Noise of the true poses is as large from frame to frame; errors of a motion add up.
     if jump_m > 0.5 * row["error_m"]:
         return f"cannot be judged, the truth jumps by {jump_m:.2g} m between frames"
     off = f"{row['error_m']:.2g} m and {row['error_deg']:.2g} deg over 1 s"
-    rest = "" if is_fitted else f", unless the truth itself is off by {off}"
-    return f"are too small, {factor:.2g} times in sigma{rest}"
+    unless = "" if "fitted" in ways else f", unless the truth itself is off by {off}"
+    return f"are too small, {factor:.2g} times in sigma{unless}{rest}"
 
 
 def nees_table(nees: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """Return the NEES of a summary as a table of text, the header first; empty without any."""
-    rows = [
-        (
-            f"{name} over {span.removesuffix('s')} s, {way}",
-            str(row["n"]),
-            *(f"{row[key]:.2f}" for key in ("rotation", "translation", "along")),
-            f"{row['low']:.2f} to {row['high']:.2f}",
-        )
-        for name, spans in nees.items()
-        for span, ways in spans.items()
-        for way, row in ways.items()
+    """Return the NEES of a summary as a table of text, the header first."""
+    rows: list[tuple[str, ...]] = [
+        ("NEES of motions", "n", "rotation", "translation", "along", "by chance")
     ]
-    header = ("NEES of motions", "n", "rotation", "translation", "along", "by chance")
-    return [header, *rows] if rows else []
+    for name, spans in nees.items():
+        for span, ways in spans.items():
+            for way, row in ways.items():
+                first = f"{name} over {span.removesuffix('s')} s, {way}", str(row["n"])
+                errors = (f"{row[key]:.2f}" for key in ("rotation", "translation", "along"))
+                rows.append((*first, *errors, f"{row['low']:.2f} to {row['high']:.2f}"))
+    return rows
 
 
 def reference_words(reference: Mapping[str, Any] | str | None) -> str:

@@ -207,7 +207,7 @@ def covariance_plot(item: Consistency, first_ns: int) -> Plot:
     """Return errors of motions with their 3-sigma bands."""
     inside = 100.0 * np.mean(np.abs(item.errors) <= _SIGMAS * item.sigmas, axis=0)
     shares = {"position": inside[3:].mean(), "rotation": inside[:3].mean()}
-    return _plot("covariance", _bands(item, first_ns), name=item.name, **shares)
+    return _plot("covariance", _bands(item, first_ns), **shares)
 
 
 def _bands(item: Consistency, first_ns: int) -> Figure:
@@ -221,7 +221,7 @@ def _bands(item: Consistency, first_ns: int) -> Figure:
         reach = _SIGMAS * factor * item.sigmas[:, index]
         panel.fill_between(x, -reach, reach, color=_RAW.color, **band)
         y = factor * item.errors[:, index]
-        draw_curve(panel, x, y, _RAW, label=item.name)
+        draw_curve(panel, x, y, _RAW, label="raw over 1 s")
         kind = "position" if unit == "m" else "rotation"
         panel.set_ylabel(f"{kind} {letter} [{unit}]")
     for panel in panels[-1]:

@@ -5,7 +5,6 @@ from typing import Any
 import pytest
 
 from gvo.io.run_folder.verdict import loop_words, nees_table, reference_words, verdict
-from gvo.trajectory.consistency import TOO_SHORT
 
 
 def row(nees: float, *, error_m: float = 0.05, **changes: float) -> dict[str, Any]:
@@ -187,7 +186,7 @@ ACROSS = "; across the way the reference cannot tell"
 def test_a_drive_is_judged_by_rotation_and_along(found: dict[str, Any], words: str) -> None:
     drive = summary(nees=nees(row(1.0), found), heading_deg=4.0)
     assert verdict(drive).endswith(f"Covariances {words}{ACROSS}.")
-    for other in ({"path_m": 19.0}, {"heading_deg": 16.0}, {"heading_deg": None}):
+    for other in ({"path_m": 19.0}, {"heading_deg": 16.0}):
         assert "across" not in verdict(drive | other)
 
 
@@ -199,7 +198,7 @@ def test_the_table_of_nees_has_a_row_for_each_way() -> None:
         ("window over 1 s, bare", "40", "7.00", "7.00", "7.00", "0.60 to 1.50"),
         ("window over 1 s, fitted", "40", "1.50", "1.50", "0.25", "0.60 to 1.50"),
     ]
-    assert nees_table({}) == []
+    assert len(nees_table({})) == 1
 
 
 def test_a_sentence_tells_what_was_fitted_of_the_reference() -> None:
@@ -210,7 +209,10 @@ def test_a_sentence_tells_what_was_fitted_of_the_reference() -> None:
         "is 4.3 \u00b1 0.62 ms early."
     )
     assert reference_words(found | {"delay_ms": 4.31, "sigmas": sigmas}).endswith("ms late.")
-    assert reference_words(TOO_SHORT) == "The run is too short to fit where the reference lies."
+    assert (
+        reference_words("too short to fit")
+        == "The run is too short to fit where the reference lies."
+    )
     assert reference_words(None) == ""
 
 
