@@ -46,6 +46,8 @@ COVARIANCE_HEADER = "stamp_ns," + ",".join(
     f"{_AXES[i]}_{_AXES[j]}" for i, j in zip(*np.triu_indices(6), strict=True)
 )
 """First line of a covariance file: the upper triangle, row by row."""
+EFFECTS = "effects.npy"
+"""How errors that all steps share move the raw poses, shape (n, 6, k): a file of numpy."""
 
 
 def read_trajectory(path: str | Path, *, is_growing: bool = False) -> Trajectory:
@@ -57,7 +59,7 @@ def read_trajectory(path: str | Path, *, is_growing: bool = False) -> Trajectory
     without one, row n gets n seconds, and `stamps_from` is "rows". Of successive rows with the
     same stamp the last is kept, see `Trajectory.n_repeated`. Where `NAME_covariance.csv` lies
     beside `NAME.txt`, as in a run's folder, and holds all its stamps, the poses have these
-    covariances.
+    covariances; `raw.txt` has the effects of shared errors by `effects.npy` beside it.
 
     Parameters
     ----------
@@ -123,8 +125,20 @@ def _with_covariances(
     _, own, rows = np.intersect1d(trajectory.stamps_ns, stamps_ns, return_indices=True)
     if is_growing and beside.is_file():
         trajectory = trajectory.select(own)
-    is_whole = len(rows) == len(trajectory)
-    return replace(trajectory, covariances=covariances[rows]) if is_whole else trajectory
+    if len(rows) < len(trajectory):
+        return trajectory
+    trajectory, effects = (
+        replace(trajectory, covariances=covariances[rows]),
+        path.with_name(EFFECTS),
+    )
+    if path.stem != "raw" or not effects.is_file():
+        return trajectory
+    try:
+        found = np.load(effects, allow_pickle=False)
+        n = min(len(found), len(trajectory)) if is_growing else len(trajectory)
+        return replace(trajectory.select(slice(n)), effects=found[:n] if is_growing else found)
+    except (OSError, ValueError, TypeError, EOFError) as error:
+        raise TrajectoryError(f"{effects}: is damaged: {error}; run again") from error
 
 
 def read_covariances(path: str | Path) -> tuple[IntArray, FloatArray]:

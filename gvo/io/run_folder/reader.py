@@ -16,14 +16,7 @@ from numpy.typing import NDArray
 from gvo._text import exists, read_text, text_lines
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
-from gvo.io.run_folder.writer import (
-    EFFECTS,
-    GLOBAL,
-    POSITIONS_HEADER,
-    TRAJECTORIES,
-    TRUE_POSITIONS,
-    TRUTH,
-)
+from gvo.io.run_folder.writer import GLOBAL, POSITIONS_HEADER, TRAJECTORIES, TRUE_POSITIONS, TRUTH
 from gvo.trajectory.evaluation import SMOOTHED_GLOBAL
 from gvo.trajectory.formats import MAX_LINES, MAX_POSITION_M, read_trajectory
 from gvo.trajectory.trajectory import StampsFrom, Trajectory
@@ -169,22 +162,9 @@ def read_run(folder: str | Path) -> RunRecord:
 
 
 def read_estimates(folder: Path, *, is_growing: bool = False) -> dict[str, Trajectory]:
-    """Read the trajectories of a run, the global one where there is one, as `read_trajectory` does.
-
-    The raw one comes with the effects of shared errors, if the run knew any.
-    """
+    """Read the trajectories of a run, the global one where there is one, as `read_trajectory`."""
     names = [*TRAJECTORIES, *([GLOBAL] if (folder / f"{GLOBAL}.txt").is_file() else [])]
-    found = {name: read_trajectory(folder / f"{name}.txt", is_growing=is_growing) for name in names}
-    path, raw = folder / EFFECTS, found["raw"]
-    if not path.is_file() or raw.covariances is None:
-        return found
-    try:
-        effects = np.load(path, allow_pickle=False)
-        n = min(len(effects), len(raw)) if is_growing else len(raw)  # one may be a pose ahead
-        found["raw"] = replace(raw.select(slice(n)), effects=effects[:n])
-    except (OSError, ValueError, TypeError, EOFError) as error:
-        raise TrajectoryError(f"{path}: is damaged: {error}; run again") from error
-    return found
+    return {name: read_trajectory(folder / f"{name}.txt", is_growing=is_growing) for name in names}
 
 
 def pose_files(path: str) -> list[str]:

@@ -22,6 +22,7 @@ from gvo.geometry import se3
 from gvo.io.run_folder.line_file import append_whole, check_folder, locked, replace_text
 from gvo.trajectory.formats import (
     COVARIANCE_HEADER,
+    EFFECTS,
     format_covariance_line,
     format_tum_line,
     write_tum,
@@ -42,8 +43,6 @@ TRAJECTORIES = ("raw", "causal", "smoothed")
 """Those that are written as the run goes."""
 GLOBAL = "global"
 """The one that comes at its end."""
-EFFECTS = "effects.npy"
-"""How errors that all steps share move the raw poses, shape (n, 6, k): a file of numpy."""
 GRAPH = "graph.g2o"
 LOOPS = "loops.csv"
 LOOPS_HEADER = (

@@ -76,6 +76,8 @@ def test_what_shared_errors_do_to_raw_poses_is_read(copy: Path) -> None:
     raw = read_run(copy).trajectories["raw"]
     assert raw.effects is not None
     np.testing.assert_array_equal(raw.effects, effects)
+    alone = read_trajectory(copy / "raw.txt")
+    np.testing.assert_array_equal(alone.motion(1, 4).covariance, raw.motion(1, 4).covariance)
     assert effects.shape == (N, 6, 9)
     assert not effects[0].any()
     assert effects[1:].any(axis=(1, 2)).all()
