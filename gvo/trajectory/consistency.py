@@ -260,10 +260,9 @@ def judged(truth: Trajectory, raw: Trajectory, window: Mapping[int, Motions]) ->
     if not truth.has_rotations:
         return found
     # The errors of the raw chain are larger, and go with the motion as those of a reference do.
-    reference, ways = fit_reference(truth, window[SPANS_S[0]]), {"bare": truth}
-    found["reference"] = "too short to fit"
-    if reference is not None:
-        found["reference"], ways["fitted"] = reference.as_json(), reference.corrected(truth)
+    reference = fit_reference(truth, window[SPANS_S[0]])
+    found["reference"] = reference.as_json() if reference else "too short to fit"
+    ways = {"bare": truth} | ({"fitted": reference.corrected(truth)} if reference else {})
     of_chain = {span_s: motions_of_chain(raw, span_s) for span_s in SPANS_S}
     for name, of_spans in {"raw": of_chain, "window": window}.items():
         found["nees"][name] = of_name = {}

@@ -251,9 +251,12 @@ def test_a_line_without_an_end_takes_no_memory(tmp_path: Path) -> None:
         ("summary.json", "[" * 50000),
         ("summary.json", json.dumps({"T_base_truth": "x"})),
         ("summary.json", json.dumps({"T_base_truth": [[1e200] * 4] * 4})),
+        ("summary.json", json.dumps({"nees": {"raw": {"1s": {"bare": {"n": 3}}}}})),
+        ("summary.json", json.dumps({"nees": [1]})),
+        ("summary.json", json.dumps({"reference": {"rotation_deg": 1}})),
         ("frames.csv", "x" * 200000 + "\n"),
     ],
-    ids=range(4),
+    ids=range(7),
 )
 def test_a_run_folder_that_means_harm_is_refused(name: str, content: str, tmp_path: Path) -> None:
     for own in ("raw.txt", "causal.txt", "smoothed.txt"):

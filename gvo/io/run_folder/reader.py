@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from gvo._text import exists, read_text, text_lines
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
+from gvo.io.run_folder.verdict import nees_table, reference_words
 from gvo.io.run_folder.writer import GLOBAL, POSITIONS_HEADER, TRAJECTORIES, TRUE_POSITIONS, TRUTH
 from gvo.trajectory.evaluation import SMOOTHED_GLOBAL
 from gvo.trajectory.formats import MAX_LINES, MAX_POSITION_M, read_trajectory
@@ -182,10 +183,12 @@ def read_summary(folder: Path) -> dict[str, Any]:
         return {}
     try:
         summary = json.loads(read_text(path, max_bytes=MAX_SUMMARY_BYTES))
-    except (OSError, ValueError, RecursionError) as error:
+        if not isinstance(summary, dict):
+            raise RecordingError(f"{path}: holds no object; {_EXPECTED}")
+        nees_table(summary.get("nees") or {})
+        reference_words(summary.get("reference"))
+    except (OSError, ValueError, RecursionError, AttributeError, LookupError, TypeError) as error:
         raise RecordingError(f"{path}: is damaged: {error}; run again") from error
-    if not isinstance(summary, dict):
-        raise RecordingError(f"{path}: holds no object; {_EXPECTED}")
     fault = _transform_fault(summary.get("T_base_truth"))
     if fault:
         raise RecordingError(f"{path}: T_base_truth {fault}; run again")
