@@ -51,9 +51,9 @@ def test_run_writes_and_prints_errors(command: Command, room_bag: Path, tmp_path
     )
     assert answer.err == ""
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    of_graph = {"global.txt", "global_covariance.csv", "graph.g2o", "loops.csv"}
+    others = {"effects.npy", "global.txt", "global_covariance.csv", "graph.g2o", "loops.csv"}
     assert (
-        names == {*TABLES, "timings.csv", "ground_truth.txt", "summary.json", "rig.yaml"} | of_graph
+        names == {*TABLES, "timings.csv", "ground_truth.txt", "summary.json", "rig.yaml"} | others
     )
 
 
