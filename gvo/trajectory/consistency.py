@@ -22,6 +22,7 @@ N_DOF = 6
 _MIN_MOTIONS = 20.0  # that do not overlap
 # Before any motion: of the rotation in radians, the lever arm in metres, the delay in seconds.
 _PRIOR_SIGMAS = np.array([np.deg2rad(0.6)] * 3 + [0.02] * 3 + [0.01])
+_AROUND_NS = 20_000_000  # the velocity of the truth is that over twice this, at least
 _N_STEPS, _HUBER_SIGMAS = 6, 3.0
 _SIGMA_OF_MEDIAN = 1.4826  # of a normal distribution: sigma over median deviation
 
@@ -231,10 +232,12 @@ def _derivatives(truth: Trajectory, found: Consistency) -> FloatArray:
 
 def _velocities(truth: Trajectory, stamps_ns: IntArray) -> FloatArray:
     """Return twists per second of interpolated poses, shape (n, 6)."""
-    after = np.clip(np.searchsorted(truth.stamps_ns, stamps_ns), 1, len(truth) - 1)
-    T_a, T_b = truth.T_world_frame[after - 1], truth.T_world_frame[after]
-    seconds = 1e-9 * (truth.stamps_ns[after] - truth.stamps_ns[after - 1])
-    return np.asarray(se3.log(se3.invert(T_a) @ T_b) / seconds[:, np.newaxis])
+    # Not by the poses beside a stamp: their noise is in the errors, too, and would bias the delay.
+    known_ns = truth.stamps_ns
+    a = np.maximum(np.searchsorted(known_ns, stamps_ns - _AROUND_NS) - 2, 0)
+    b = np.minimum(np.searchsorted(known_ns, stamps_ns + _AROUND_NS) + 1, len(truth) - 1)
+    twists = se3.log(se3.invert(truth.T_world_frame[a]) @ truth.T_world_frame[b])
+    return np.asarray(twists / (1e-9 * (known_ns[b] - known_ns[a]))[:, np.newaxis])
 
 
 def judged(truth: Trajectory, raw: Trajectory, window: Mapping[int, Motions]) -> dict[str, Any]:

@@ -228,6 +228,19 @@ def test_motions_are_not_trusted_more_than_they_say() -> None:
     doubtful = replace(motions, covariances=100.0 * motions.covariances)
     ratios = fitted(truth, doubtful).sigmas / fitted(truth, motions).sigmas
     assert np.all((ratios > 1.5) & (ratios < 11.0))
+    # what tells hardly anything leaves the reference where it is by itself
+    dim = fitted(truth, replace(motions, covariances=1e5 * motions.covariances))
+    assert np.all(np.abs(dim.values) < 0.2 * np.abs(PLANTED))
+
+
+def test_noise_of_the_reference_makes_it_less_certain() -> None:
+    truth, raw = referred(0)
+    noise = np.random.default_rng(0).normal(scale=5e-3, size=(len(truth), 6))
+    noisy = replace(truth, T_world_frame=truth.T_world_frame @ se3.exp(noise))
+    motions = motions_of_chain(raw)
+    found = fitted(noisy, motions)
+    assert np.all(found.sigmas > 1.3 * fitted(truth, motions).sigmas)
+    assert np.all(np.abs(found.values - PLANTED) < 4.0 * found.sigmas)
 
 
 def test_where_the_truth_jumps_the_fit_stays() -> None:
@@ -252,6 +265,13 @@ def test_covariances_are_judged_bare_and_fitted() -> None:
     assert reference["lever_m"] == pytest.approx(PLANTED[3:6].tolist(), abs=0.006)
     assert reference["rotation_deg"] == pytest.approx([0.5, -0.4, 0.3], abs=0.2)
     assert [*reference["sigmas"]] == ["rotation_deg", "lever_m", "delay_ms"]
+
+
+def test_the_reference_is_fitted_to_the_window_which_errs_less() -> None:
+    truth, raw = referred(0)
+    exact = motions_of_chain(replace(raw, T_world_frame=hand(raw.stamps_ns / 1e9)))
+    reference = judged(truth, raw, {1: exact})["reference"]
+    assert reference["lever_m"] == pytest.approx(PLANTED[3:6].tolist(), abs=3e-4)
 
 
 def test_of_an_exact_truth_both_ways_agree() -> None:
