@@ -470,8 +470,7 @@ def _tell_covariances(runs: Mapping[str, Mapping[str, Any]]) -> None:
     for folder, summary in runs.items():
         header, *rows = nees_table(summary.get("nees") or {})
         if rows:
-            title = f"\n{folder}: motions against its ground truth\n"
-            say(title + format_table(header, rows), nl=False)
+            say(f"\n{folder}, against its ground truth\n{format_table(header, rows)}", nl=False)
             say(reference_words(summary.get("reference")))
 
 

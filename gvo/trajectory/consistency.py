@@ -23,8 +23,8 @@ _MIN_MOTIONS = 20.0  # that do not overlap
 # Before any motion: of the rotation in radians, the lever arm in metres, the delay in seconds.
 _PRIOR_SIGMAS = np.array([np.deg2rad(0.6)] * 3 + [0.02] * 3 + [0.01])
 _AROUND_NS = 20_000_000  # the velocity of the truth is that over twice this, at least
-_N_STEPS, _HUBER_SIGMAS = 6, 3.0
-_SIGMA_OF_MEDIAN = 1.4826  # of a normal distribution: sigma over median deviation
+# The last is that of a normal distribution: sigma over median deviation.
+_N_STEPS, _HUBER_SIGMAS, _SIGMA_OF_MEDIAN = 6, 3.0, 1.4826
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -84,7 +84,7 @@ class Consistency(Motions):
     def mean_nees(self) -> tuple[float, float, float]:
         """Return the mean NEES per degree of freedom: rotation, translation, along the way."""
         T, C = self.T_start_end, self.covariances
-        # Of a motion in the frame at its end; at rest along the optical axis.
+        # Of a motion in the frame at its end; at rest along z.
         way = (np.swapaxes(T[:, :3, :3], 1, 2) @ T[:, :3, 3:])[..., 0] + [0.0, 0.0, 1e-9]
         along = np.sum(way * self.errors[:, 3:], axis=1) ** 2
         along /= np.einsum("ni,nij,nj->n", way, C[:, 3:, 3:], way)

@@ -159,7 +159,7 @@ def test_compare_of_a_run_folder_tells_of_its_covariances_too(
     assert [entry["name"] for entry in found["estimates"]] == names
     assert found["runs"] == {str(run): summary | told}
     answer = command("compare", room_bag, run)
-    assert f"{run}: motions against its ground truth\n" in answer.out
+    assert f"{run}, against its ground truth\n" in answer.out
     assert re.search(
         r"window over 1 s, bare +40 +9\.00 +1\.25 +0\.50 +0\.60 to 1\.50\n", answer.out
     )

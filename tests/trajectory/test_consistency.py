@@ -88,7 +88,7 @@ def test_errors_across_the_way_are_not_along_it() -> None:
         assert along == pytest.approx(length if is_along else 0.0, rel=0.05, abs=1e-3 * length)
 
 
-def test_of_a_camera_at_rest_the_optical_axis_is_along() -> None:
+def test_of_a_camera_at_rest_its_z_axis_is_along() -> None:
     truth = Trajectory(
         stamps_ns=np.arange(11) * 10**8, T_world_frame=np.tile(np.eye(4), (11, 1, 1))
     )
