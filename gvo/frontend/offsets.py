@@ -241,6 +241,8 @@ class RigOffsets:
         What rides with the camera, and is not used.
     calibration : CalibrationErrors
         Errors that all registrations share.
+    zoom : dict of str to float
+        The first stamp that has another focal length, `zoom_ns`, and its ratio, `zoom`.
     learns_lens : bool
         The lens is learnt, and corrected.
     chain_factor, window_factor : VarianceFactor
@@ -278,6 +280,7 @@ class RigOffsets:
         self._gate = _GATE * math.sqrt(1.0 if self._rig is None else _KEPT)
         self._n_frames = 0
         self.waiting: list[Any] = []
+        self.zoom: dict[str, float] = {}
         if self._held is not None:
             self.lens, self.rows, (self.delay_s,) = (
                 self._held.of(names)[0] for names in (LENS, ROWS, (DELAY,))
@@ -447,7 +450,7 @@ class RigOffsets:
 
         Pixels less what no image tells, see `pixel_errors`. A readout with a sigma of 0 was given.
         Beside it, where there is something, how much of the view rides with the camera, and how
-        many corners were not used for that.
+        many corners were not used for that; and since which stamp it is zoomed, by how much.
         """
         value, sigma = self.readout
         disparity = (self._places - self.take_off(self._places))[:, 2]
@@ -463,6 +466,7 @@ class RigOffsets:
         carried = {"carried_percent": percent, "carried_corners": n_carried} if n_carried else {}
         return (
             carried
+            | self.zoom
             | (offsets if self._is_stereo else {})
             | {
                 "calibration_px": round(self.calibration.size_px, 3),

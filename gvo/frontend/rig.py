@@ -23,6 +23,7 @@ from gvo.config import Config
 from gvo.frontend.calibration import CONSIDERED
 from gvo.frontend.offsets import RigOffsets
 from gvo.frontend.registration import check_rows, estimate_roughly, register_correspondences
+from gvo.frontend.zoom import HARDEST_MPS2, LONGEST_S, find_zoom
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
@@ -260,12 +261,23 @@ class CalibratedCamera:
             # What was found roughly may be the other one of two motions, or none.
             note_step(*frames, None if prior is None else prior.T_predicted)
             result = self._register(measured, config, prior, None)
+        step, elapsed_s = frames[0].motion.step, 1e-9 * (frames[1].stamp_ns - frames[0].stamp_ns)
+        if is_step and step is not None and 0.0 < elapsed_s < LONGEST_S and not self._offsets.zoom:
+            found_m = np.inf if isinstance(result, Failure) else result.T_reference_current[:3, 3]
+            # A step fails, or changes the velocity as no motion does.
+            if np.linalg.norm(found_m - elapsed_s * step[3:]) > HARDEST_MPS2 * elapsed_s**2:
+                self._look_for_zoom(measured, se3.exp(elapsed_s * step))
         if isinstance(result, Failure):
             return result
         if is_step and frames[1].motion.measured is None:
             note_step(*frames, result.T_reference_current)
         self._found = measured
         return check_rows(result, self._camera)
+
+    def _look_for_zoom(self, measured: Measurements, T: FloatArray) -> None:
+        ratio = find_zoom(self._corrected(measured), T, self._camera)
+        if ratio is not None:
+            self._offsets.zoom = {"zoom": round(ratio, 4), "zoom_ns": measured.stamps_ns[1]}
 
     def begin(
         self, measured: Measurements, config: Config, *, prior: MotionPrior | None, is_step: bool

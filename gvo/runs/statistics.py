@@ -13,12 +13,15 @@ import numpy as np
 from gvo.backend.batch import BatchResult
 from gvo.backend.window import WindowCounts
 from gvo.frontend.offsets import RigOffsets
-from gvo.types import FaultyFrame, FrameResult, Progress, SegmentJoin, Status
+from gvo.frontend.zoom import HARDEST_MPS2
+from gvo.types import Estimate, FaultyFrame, FrameResult, Progress, SegmentJoin, Status
 
 # A run with a larger share of untracked poses is not complete.
 _MAX_UNTRACKED_SHARE = 0.1
 # The moving head or arm of a robot displaces its camera by less.
 _MAX_MOUNT_TRAVEL_M = 2.0
+# What moves by less than this share of its speed before stands still, for so many frames at least.
+_STILL_SHARE, _N_STILL = 0.1, 10
 
 
 @dataclass(slots=True, kw_only=True)
@@ -51,6 +54,8 @@ class RunStatistics:
     rig_offsets: RigOffsets | None = None
     stages: dict[str, array[float]] = field(default_factory=dict)
     segments: dict[int, Segment] = field(default_factory=dict)
+    standstill: dict[str, float] | None = None
+    _raws: list[Estimate] = field(default_factory=list)
 
     @property
     def n_frames(self) -> int:
@@ -93,6 +98,7 @@ class RunStatistics:
             "status_counts": {status.value: self.statuses[status] for status in Status},
             "unpaired_images": self.n_unpaired,
             "window": asdict(self.window),
+            "standstill": self.standstill,
             "batch": None if self.batch_result is None else self.batch_result.as_json(),
             "rig_offsets": None if self.rig_offsets is None else self.rig_offsets.as_json(),
             "median_ms": {
@@ -118,6 +124,7 @@ class RunStatistics:
         """Count a frame."""
         self.statuses[result.status] += 1
         self._add_to_segment(result)
+        self._look_for_standstill(result.raw)
         for join in result.joins:
             self._join(join)
         self.first_untracked = self.first_untracked or result.reason
@@ -131,6 +138,20 @@ class RunStatistics:
         segment.last_stamp_ns = stamp_ns
         segment.n_frames += 1
         segment.n_tracked += result.status in (Status.OK, Status.RESUMED)
+
+    def _look_for_standstill(self, raw: Estimate) -> None:
+        """Tell images that stand still after two steps at a speed that no brake takes away."""
+        self._raws = [*self._raws[-_N_STILL - 2 :], raw] if raw.status is Status.OK else []
+        if self.standstill is not None or len(self._raws) < _N_STILL + 3:
+            return
+        elapsed_s = 1e-9 * np.diff([each.stamp_ns for each in self._raws])
+        positions = np.array([each.T_world_frame[:3, 3] for each in self._raws])
+        speeds_mps = np.linalg.norm(np.diff(positions, axis=0), axis=1) / elapsed_s
+        lasting_mps = speeds_mps[:2].min()
+        is_halt = lasting_mps - speeds_mps[2] > HARDEST_MPS2 * elapsed_s[2]
+        if is_halt and speeds_mps[2:].max() < _STILL_SHARE * lasting_mps:
+            speed_mps = round(float(speeds_mps[1]), 2)
+            self.standstill = {"frame": self.n_frames - _N_STILL, "speed_mps": speed_mps}
 
     def _join(self, join: SegmentJoin) -> None:
         """Let the later one of two groups of segments point to the earlier one."""

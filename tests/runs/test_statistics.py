@@ -101,6 +101,47 @@ def test_segments_that_nothing_ties_to_others_are_a_warning() -> None:
     assert statistics.unjoined == [statistics.segments[0]]
 
 
+RATE_HZ = 10
+
+
+def driven(speeds_mps: list[float], *, lost: tuple[int, ...] = ()) -> RunStatistics:
+    """Return the counts of a drive: the speed of each step, and steps that are no measurement."""
+    statistics, T = RunStatistics(), np.eye(4)
+    for frame, speed_mps in enumerate([0.0, *speeds_mps]):
+        T[2, 3] += speed_mps / RATE_HZ
+        status = Status.COASTING if frame in lost else Status.OK
+        raw = estimate_at(frame * 10**9 // RATE_HZ, T.copy(), status=status)
+        statistics.add_result(result_of(raw))
+    return statistics
+
+
+def test_images_that_stand_still_in_mid_motion_are_told() -> None:
+    found = driven([8.0] * 20 + [0.02] * 30).as_json()["standstill"]
+    assert found == {"frame": 21, "speed_mps": 8.0}
+    # the first of two, and not what did not last
+    found = driven([8.0] * 20 + [0.0] * 10 + [9.0] * 5 + [0.0] * 10).as_json()["standstill"]
+    assert found["frame"] == 21
+    found = driven([8.0] * 20 + [0.0] * 9 + [9.0] * 5 + [0.0] * 10).as_json()["standstill"]
+    assert found == {"frame": 35, "speed_mps": 9.0}
+
+
+@pytest.mark.parametrize(
+    ("speeds_mps", "lost"),
+    [
+        ([8.0, 6.0, 4.0, 2.0] + [0.0] * 30, ()),  # 20 m/s^2
+        ([2.5] * 20 + [0.0] * 30, ()),  # a slow one may halt within a frame
+        ([8.0] * 20 + [4.0] * 30, ()),
+        ([8.0] * 20 + [0.0] * 9 + [8.0] * 5, ()),
+        ([0.0] * 20 + [8.0] + [0.0] * 30, ()),  # one step that is wrong
+        ([8.0] * 20 + [0.0] * 30, (20,)),  # a guess tells no speed
+    ],
+)
+def test_a_halt_and_a_wrong_step_are_no_standstill(
+    speeds_mps: list[float], lost: tuple[int, ...]
+) -> None:
+    assert driven(speeds_mps, lost=lost).as_json()["standstill"] is None
+
+
 @given(durations=st.lists(st.floats(0.0, 1e6), min_size=1, max_size=40))
 def test_the_time_of_a_stage_is_its_median(durations: list[float]) -> None:
     statistics = RunStatistics()

@@ -250,6 +250,40 @@ def test_the_verdict_names_what_was_learnt(offsets: dict[str, Any], looks: list[
     assert after == (f" Worth a look: {text}. Covariances fit." if looks else " Covariances fit.")
 
 
+LATE = {"delay_ms": 23.8, "disparity_px": 1.4, "row_px": 0.8}
+ZOOMED = {"zoom": 1.0996, "zoom_ns": 15_100_000_000, "disparity_px": 1.4, "row_px": 0.8}
+STILL = {"frame": 151, "speed_mps": 9.84}
+
+
+@pytest.mark.parametrize(
+    ("told", "look"),
+    [
+        (
+            {"rig_offsets": LATE},
+            "the trigger, right images are exposed 24 ms after left ones (learnt, and corrected in "
+            "part)",
+        ),
+        (
+            {"rig_offsets": ZOOMED},
+            "zoom and focus, which have to be fixed: the view is 1.1 times as large from 15.100 s "
+            "on",
+        ),
+        (
+            {"standstill": STILL},
+            "the camera's driver, images stand still from frame 151 on, at 9.8 m/s the frame "
+            "before",
+        ),
+    ],
+)
+def test_a_large_fault_is_the_one_cause(told: dict[str, Any], look: str) -> None:
+    errors = [{"name": "smoothed", "n": 393, "ate_m": 9.0, "scale": 0.5, "scaled_ate_m": 0.2}]
+    said = verdict(summary(errors=errors, **told))
+    assert said == (
+        f"298 m in 393 frames, all tracked; 9 m from the truth. Worth a look: {look}. "
+        "Covariances fit."
+    )
+
+
 def test_the_verdict_says_what_rides_with_the_camera() -> None:
     said = verdict(summary(rig_offsets={"carried_percent": 23.4, "carried_corners": 812}))
     assert said.endswith("23 % of the view rides with the camera (812 corners): not used.")
