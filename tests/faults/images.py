@@ -10,6 +10,7 @@ from typing import Any, Literal, TypeAlias
 import cv2
 import numpy as np
 
+from gvo.geometry.camera import PinholeCamera
 from gvo.testing.faults import Fault, FaultyImage, PixelFault, Pixels
 
 _WHITE = 255
@@ -83,6 +84,30 @@ def covered(pixels: Pixels, frame: int, rng: Rng) -> Pixels:
         is_covered = (u - centre_u) ** 2 + (v - centre_v) ** 2 < radius**2
         changed[is_covered] = np.asarray(dirt)[is_covered]
     return changed
+
+
+def bonnet(
+    pixels: Pixels, frame: int, rng: Rng, part: float, shift_px: float, sigma: float = 2.0
+) -> Pixels:
+    """Cover the lower part of the view by what rides with the camera, moved to the left."""
+    height, width = pixels.shape
+    rows, columns = np.mgrid[:height, :width]
+    edge = 1.0 - part + 0.08 * (2.0 * columns / width - 1.0) ** 2 + 0.01 * np.sin(columns)
+    white = np.random.default_rng(3).normal(size=pixels.shape).astype(np.float32)
+    smooth = np.asarray(cv2.GaussianBlur(white, (0, 0), 1.2))
+    M = np.array([[1.0, 0.0, -shift_px], [0.0, 1.0, 0.0]])
+    texture = 110.0 + 40.0 * smooth / smooth.std()
+    seen = cv2.warpAffine(texture, M, (width, height), borderMode=cv2.BORDER_REFLECT)
+    return np.where(rows > edge * height, noisy(seen, frame, rng, sigma), pixels)
+
+
+def along_ray(pixels: Pixels, frame: int, rng: Rng, camera: PinholeCamera, size: float) -> Pixels:
+    """Measure depth along the ray of each pixel, not along the optical axis; size 1: all of it."""
+    u, v = np.meshgrid(np.arange(pixels.shape[1]), np.arange(pixels.shape[0]))
+    rays = camera.unproject(np.dstack([u, v]).astype(np.float64))
+    lengths = np.linalg.norm(rays, axis=-1)
+    measured: Pixels = pixels * (1.0 + size * (lengths - 1.0))
+    return measured.astype(pixels.dtype)
 
 
 def constant(pixels: Pixels, frame: int, rng: Rng, value: float = float("nan")) -> Pixels:

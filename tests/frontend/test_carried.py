@@ -4,13 +4,13 @@ from dataclasses import replace
 from functools import cache
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
 import gvo
 from gvo.frontend.factory import make_frontend
-from gvo.types import BoolArray, Frame, ImageArray, RgbdFrame, StereoFrame
+from gvo.types import Frame, RgbdFrame, StereoFrame
+from tests.faults import bonnet
 from tests.make.recordings import frames_of
 
 N_FRAMES = 14
@@ -23,28 +23,15 @@ def drive(world: str = "driving", sensor: str = "stereo") -> gvo.SyntheticRecord
     return recording(world, sensor, n_frames=N_FRAMES, seed=1, scale=0.4)  # type: ignore[no-any-return]
 
 
-def texture(shape: tuple[int, int]) -> ImageArray:
-    noise = np.random.default_rng(3).normal(size=shape).astype(np.float32)
-    smooth = cv2.GaussianBlur(noise, (0, 0), 1.2)
-    return np.asarray(np.clip(110 + 40 * smooth / smooth.std(), 0, 255), dtype=np.uint8)
-
-
-def bonnet(shape: tuple[int, int]) -> BoolArray:
-    """Return the lower 30 % of the view, with a bent edge."""
-    rows, columns = np.mgrid[: shape[0], : shape[1]]
-    edge = 0.67 + 0.08 * (2.0 * columns / shape[1] - 1.0) ** 2 + 0.01 * np.sin(columns)
-    return np.asarray(rows > edge * shape[0])
-
-
 def with_bonnet(frame: Frame) -> Frame:
-    """Return a frame with what does not move with the world in the lower part of its images."""
+    """Return a frame with what does not move with the world in the lower 33 % of its images."""
     assert isinstance(frame, StereoFrame)
-    images = []
-    for image, shift in ((frame.left, 0.0), (frame.right, BONNET_PX)):
-        M, size = np.array([[1.0, 0.0, -shift], [0.0, 1.0, 0.0]]), image.shape[::-1]
-        seen = cv2.warpAffine(texture(image.shape), M, size, borderMode=cv2.BORDER_REFLECT)
-        images.append(np.where(bonnet(image.shape), seen, image))
-    return replace(frame, left=images[0], right=images[1])
+    rng = np.random.default_rng(frame.stamp_ns)
+    left, right = (
+        bonnet(image, 0, rng, part=0.33, shift_px=shift_px, sigma=0.0)
+        for image, shift_px in ((frame.left, 0.0), (frame.right, BONNET_PX))
+    )
+    return replace(frame, left=left, right=right)
 
 
 def track(frames: list[Frame], kind: str = "klt") -> gvo.Odometry:
