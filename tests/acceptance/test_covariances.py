@@ -82,9 +82,9 @@ class Run:
     ("world", "sensor", "n_frames", "size_px"),
     [
         ("driving", "stereo", 120, 0.25),
-        ("handheld", "stereo", 200, 0.25),
+        pytest.param("handheld", "stereo", 200, 0.25, marks=pytest.mark.thorough),
         ("handheld", "rgbd", 200, 0.25),
-        ("handheld", "rgbd", 200, 0.0),
+        pytest.param("handheld", "rgbd", 200, 0.0, marks=pytest.mark.thorough),
     ],
 )
 def test_covariances_hold(world: WorldName, sensor: Sensor, n_frames: int, size_px: float) -> None:

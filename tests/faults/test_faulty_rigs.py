@@ -108,18 +108,18 @@ FAULTS: dict[str, Callable[[float, int], Source]] = {
     "zoom": partial(zoom, world=DRIVE, sensor="stereo"),
     "zoom-rgbd": partial(zoom, world=HAND, sensor="rgbd"),
 }
-# The sizes, and what is right.
-CASES: list[tuple[str, tuple[float, ...], float | str]] = [
-    ("bonnet", (0.5, 1.0), POSITION),
+# The sizes, and what the verdict tells; empty where poses are right, or covariances large enough.
+CASES: list[tuple[str, tuple[float, ...], str]] = [
+    ("bonnet", (0.5, 1.0), ""),
     ("bonnet", (2.0,), RIDES),
-    ("rolled", (0.5, 1.0, 2.0), POSITION),
-    ("yawed", (0.5, 1.0, 2.0, -1.0), POSITION),
-    ("scaled", (0.5, 1.0, 2.0, -1.0), POSITION),
-    ("late-10", (0.5, 1.0, 2.0), POSITION),
+    ("rolled", (0.5, 1.0, 2.0), ""),
+    ("yawed", (0.5, 1.0, 2.0, -1.0), ""),
+    ("scaled", (0.5, 1.0, 2.0, -1.0), ""),
+    ("late-10", (0.5, 1.0, 2.0), ""),
     ("late-30", (0.5, 1.0, 2.0, -1.0), LATE),
     ("frozen", (0.5, 1.0, 2.0), STILL),
-    ("along-ray", (0.5, 1.0, 2.0), NEES),
-    ("mirrored", (1.0,), POSITION),
+    ("along-ray", (0.5, 1.0, 2.0), ""),
+    ("mirrored", (1.0,), ""),
     ("zoom", (0.5, 1.0, 2.0, -1.0), ZOOM),
     ("zoom-rgbd", (0.5, 1.0, 2.0, -1.0), ZOOM),
 ]
@@ -163,21 +163,30 @@ def run(source: Source, out: Path) -> Outcome:
     )
 
 
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    ("name", "size", "told"),
+    [(name, size, told) for name, sizes, told in CASES for size in sizes],
+)
+def test_a_faulty_rig_is_not_certain(name: str, size: float, told: str, tmp_path: Path) -> None:
+    assert_not_certain(name, size, told, N_FRAMES, tmp_path)
+
+
 @pytest.mark.acceptance
 @pytest.mark.parametrize(
-    ("name", "size", "right"),
-    [(name, size, right) for name, sizes, right in CASES for size in sizes],
+    ("name", "told"),
+    [(name, told) for name, sizes, told in CASES if 1.0 in sizes and told in ("", LATE)],
 )
-def test_a_faulty_rig_is_not_certain(
-    name: str, size: float, right: float | str, tmp_path: Path
-) -> None:
-    found = run(FAULTS[name](size, N_FRAMES), tmp_path)
-    if right == POSITION:
-        assert found.error_percent < POSITION
-    elif right == NEES:
-        assert max(found.nees) < NEES
+def test_a_lasting_fault_is_not_certain_after_a_while(name: str, told: str, tmp_path: Path) -> None:
+    assert_not_certain(name, 1.0, told, N_FRAMES // 2, tmp_path)
+
+
+def assert_not_certain(name: str, size: float, told: str, n_frames: int, out: Path) -> None:
+    found = run(FAULTS[name](size, n_frames), out)
+    if told:
+        assert_told(found, told, size, n_frames)
     else:
-        assert_told(found, str(right), size, N_FRAMES)
+        assert found.error_percent < POSITION or max(found.nees) < NEES
 
 
 def assert_told(found: Outcome, cause: str, size: float, n_frames: int) -> None:
@@ -201,7 +210,7 @@ def test_a_sound_rig_is_told_of_no_fault(name: str, tmp_path: Path) -> None:
     assert not SILENT & run(recorded(world, sensor, n_frames=50), tmp_path).causes
 
 
-@pytest.mark.acceptance
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", range(10))
 @pytest.mark.parametrize("name", SOUND)
 def test_sound_rigs_are_told_of_no_fault(name: str, seed: int, tmp_path: Path) -> None:
@@ -210,7 +219,7 @@ def test_sound_rigs_are_told_of_no_fault(name: str, seed: int, tmp_path: Path) -
     assert not SILENT & found.causes, found.verdict
 
 
-@pytest.mark.acceptance
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", sorted(KINDS))
 def test_no_world_looks_like_a_fault_of_the_rig(kind: str, tmp_path: Path) -> None:
     found = run(rendered(kind, n_frames=N_FRAMES, scale=SCALE), tmp_path)
