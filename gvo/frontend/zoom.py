@@ -24,7 +24,7 @@ LONGEST_S: Final = 0.25
 """A longer step is not foretold by the one before, seconds."""
 # Share of the tracks that a zoom moves, of so many at least, and how far they may be from its
 # similarity, pixels. The smallest zoom that is told: without one similarities reach 1.2 %.
-_MIN_SHARE, _MIN_TRACKS, _FITS_PX, _LEAST = 0.7, 30, 1.0, 0.03
+_MIN_SHARE, _MIN_TRACKS, _FITS_PX, _LEAST = 0.7, 30, 2.0, 0.03
 
 
 def find_zoom(found: Correspondences, T: FloatArray, camera: StereoCamera) -> float | None:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gvo.config import Config
 from gvo.io.recording import Sensor, Source
 from gvo.io.run_folder.verdict import verdict
 from gvo.io.synthetic import RigError, SyntheticRecording, World
@@ -149,8 +150,8 @@ class Outcome:
     verdict: str
 
 
-def run(source: Source, out: Path) -> Outcome:
-    summary, truth = run_of(source, out).summary, source.ground_truth()
+def run(source: Source, out: Path, **options: Any) -> Outcome:
+    summary, truth = run_of(source, out, **options).summary, source.ground_truth()
     assert truth is not None
     row = summary["nees"]["window"]["1s"]["bare"]
     error_m = read_trajectory(out / "smoothed.txt").positions[-1] - truth.positions[-1]
@@ -197,11 +198,15 @@ def assert_told(found: Outcome, cause: str, size: float, n_frames: int) -> None:
         assert f"is {1.0 + 0.1 * size:.3g} times as large from " in found.verdict
 
 
+@pytest.mark.parametrize("kind", ["klt", "descriptor"])
 @pytest.mark.parametrize(
     ("name", "right"), [("frozen", STILL), ("zoom", ZOOM), ("zoom-rgbd", ZOOM)]
 )
-def test_a_sudden_fault_is_told_within_seconds(name: str, right: str, tmp_path: Path) -> None:
-    assert_told(run(FAULTS[name](1.0, 40), tmp_path), right, 1.0, 40)
+def test_a_sudden_fault_is_told_within_seconds(
+    name: str, right: str, kind: str, tmp_path: Path
+) -> None:
+    config = Config.model_validate({"frontend": {"kind": kind}})
+    assert_told(run(FAULTS[name](1.0, 40), tmp_path, config=config), right, 1.0, 40)
 
 
 @pytest.mark.parametrize("name", SOUND)
