@@ -79,6 +79,12 @@ class CalibrationErrors:
         self._learnt = np.array([k for k, name in enumerate(names) if name in wanted], np.int64)
         self.size_px, self.root = _PRESUMED_PX, np.eye(len(CONSIDERED))
 
+    @property
+    def left_px(self) -> float:
+        """Root mean square of what stays of the constants that can be corrected, pixels."""
+        learnt = self.root[:LEARNT, :LEARNT]
+        return self.size_px * float(np.sqrt(np.sum(learnt**2) / LEARNT))
+
     def judge(
         self, information: FloatArray, vector: FloatArray, prior: FloatArray, *, is_corrected: bool
     ) -> None:

@@ -462,6 +462,8 @@ class RigOffsets:
             "row_px": round(float(np.abs(rows).max()), 4),
             "delay_ms": round(1e3 * self.delay_s, 2),
         }
+        if self.learns_lens:
+            offsets["calibration_left_px"] = round(self.calibration.left_px, 3)
         percent, n_carried = round(100.0 * self.carried.share, 1), self.carried.n_corners
         carried = {"carried_percent": percent, "carried_corners": n_carried} if n_carried else {}
         return (

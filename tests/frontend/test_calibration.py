@@ -43,6 +43,7 @@ def test_what_is_corrected_stays_uncertain_and_what_is_not_counts_with_its_value
     left = corrected.size_px**2 * corrected.root @ corrected.root.T
     # Its sigma, and what patches feign.
     assert np.sqrt(left[6, 6]) == pytest.approx(np.hypot(0.04, 0.03), rel=0.05)
+    assert corrected.left_px == pytest.approx(np.hypot(0.04, 0.03), rel=0.05)
     assert left[7, 7] == left[8, 8] == pytest.approx(corrected.size_px**2)
     found = judged(values, 0.04)
     whole = found.size_px**2 * found.root @ found.root.T

@@ -42,6 +42,7 @@ def verdict(summary: Mapping[str, Any]) -> str:
         "; ".join(filter(None, [_how_far(summary), _how_good(summary)])),
         causes and f"Likely cause: {'; '.join(causes)}",
         looks and f"Worth a look: {'; '.join(looks)}",
+        _how_calibrated(offsets),
         sure and f"Covariances {sure}",
         n_carried
         and f"{percent:.0f} % of the view rides with the camera ({n_carried} corners): not used",
@@ -130,6 +131,14 @@ def loop_words(summary: Mapping[str, Any]) -> str:
         reasons = ", ".join(f"{count}: {reason}" for reason, count in refused.items())
         words += f", {sum(refused.values())} refused ({reasons})"
     return words if n else f"{words}; global is smoothed"
+
+
+def _how_calibrated(offsets: Mapping[str, Any]) -> str:
+    if not (px := offsets.get("calibration_px")):
+        return ""
+    left_px = offsets.get("calibration_left_px")
+    after = f", after correction to {left_px:.2g} px" if left_px else ""
+    return f"The calibration is good to {px:.2g} px{after}"
 
 
 def _how_sure(summary: Mapping[str, Any]) -> str:

@@ -250,6 +250,14 @@ def test_the_verdict_names_what_was_learnt(offsets: dict[str, Any], looks: list[
     assert after == (f" Worth a look: {text}. Covariances fit." if looks else " Covariances fit.")
 
 
+def test_the_verdict_says_how_good_the_calibration_is() -> None:
+    offsets = {"calibration_px": 0.312, "calibration_left_px": 0.0461}
+    said = verdict(summary(rig_offsets=offsets))
+    assert " The calibration is good to 0.31 px, after correction to 0.046 px. Cov" in said
+    del offsets["calibration_left_px"]
+    assert " The calibration is good to 0.31 px. Cov" in verdict(summary(rig_offsets=offsets))
+
+
 LATE = {"delay_ms": 23.8, "disparity_px": 1.4, "row_px": 0.8}
 ZOOMED = {"zoom": 1.0996, "zoom_ns": 15_100_000_000, "disparity_px": 1.4, "row_px": 0.8}
 STILL = {"frame": 151, "speed_mps": 9.84}
