@@ -245,14 +245,10 @@ class Constants:
         Of the errors, by what no motion explains.
     score : ndarray of float64, shape (k,)
         The right-hand side: the errors are information^-1 score.
-    effects : ndarray of float64, shape (k, 6)
-        By how much one unit of each moves the pose (rx, ry, rz, tx, ty, tz), in the current
-        camera frame.
     """
 
     information: FloatArray
     score: FloatArray
-    effects: FloatArray
 
 
 def eliminate_pose(
@@ -270,11 +266,11 @@ def eliminate_pose(
         Those that count.
     """
     k = len(residuals.constants)
-    information, score, effects = np.empty((k, k)), np.empty(k), np.empty((k, 6))
+    information, score = np.empty((k, k)), np.empty(k)
     ended = kernels.eliminate_pose(
         *(np.array(T_reference_current), *residuals.arrays, is_used, residuals.sensitivities),
-        *(residuals.camera.parameters, residuals.huber, information, score, effects),
+        *(residuals.camera.parameters, residuals.huber, information, score),
     )
     if ended != kernels.DONE:
         return None
-    return Constants(information=information, score=score, effects=effects)
+    return Constants(information=information, score=score)

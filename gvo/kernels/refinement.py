@@ -253,30 +253,18 @@ def write_effects(T, points, uvd, factors, is_used, sensitivities, camera, huber
 
 
 @kernel(
-    *(Out("f8", 2), *_MATCHES, In("f8", 4), In("f8", 1), "f8"),
-    *(Out("f8", 2), Out("f8", 1), Out("f8", 2)),
+    *(Out("f8", 2), *_MATCHES, In("f8", 4), In("f8", 1), "f8", Out("f8", 2), Out("f8", 1)),
     returns="i8",
 )
 def eliminate_pose(
-    T,
-    points,
-    uvd,
-    factors,
-    is_used,
-    sensitivities,
-    camera,
-    huber,
-    information,
-    score,
-    effects,
+    T, points, uvd, factors, is_used, sensitivities, camera, huber, information, score
 ):
     """Write the normal equations of the errors of k constants, whatever the pose; how it ended.
 
-    Their information (k, k) and score (k): what no motion explains (the Schur complement). Effects
-    (k, 6): by how much one unit of each moves the pose.
+    Their information (k, k) and score (k): what no motion explains (the Schur complement).
     """
     n_constants = len(sensitivities)
-    size = 6 + n_constants
+    size, effects = 6 + n_constants, matrix(n_constants, 6)
     A, b, rows, r, J = matrix(size, size), vector(size), matrix(size, 3), vector(3), matrix(3, 3)
     clear(A, b)
     for k in range(len(points)):

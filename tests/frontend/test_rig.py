@@ -65,7 +65,7 @@ def told(errors: dict[str, float], sigma: float, names: tuple[str, ...]) -> Cons
     """Return what a link tells: how much is left of some constants, each with this sigma."""
     information = np.diag([sigma**-2 if name in errors else 0.0 for name in names])
     score = information @ [errors.get(name, 0.0) for name in names]
-    return Constants(information=information, score=score, effects=np.zeros((len(names), 6)))
+    return Constants(information=information, score=score)
 
 
 def config(readout_ms: float | None = None, *, estimate_offset: bool = True) -> Config:
@@ -258,8 +258,7 @@ def test_errors_of_a_lens_are_those_of_both_images() -> None:
         left_over = np.array([LEARNT.get(name, 0.0) for name in offsets.names])
         left_over[: len(offsets.lens)] -= offsets.lens
         score = information @ left_over
-        effects = np.zeros((len(sigmas), 6))
-        offsets.note(Constants(information=information, score=score, effects=effects))
+        offsets.note(Constants(information=information, score=score))
         offsets.advance()
     # To second order of the errors; a twentieth of a pixel of them stays.
     assert np.abs(measured - uvd).max() > 1.0
