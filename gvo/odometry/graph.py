@@ -346,7 +346,10 @@ class RunGraph:
         for before_ns, frame_ns in pairwise(frames_ns):
             if parts.of(before_ns) != parts.of(frame_ns):
                 way = self.path.way(before_ns, frame_ns)
-                graph.add_edges(frame_ns, [_edge(before_ns, way.T, way.covariance)])
+                # What led past a part that nothing connects left no guess of where that lies.
+                sigmas = np.repeat([TURN_SIGMA, SHIFT_SIGMA], 3) * 1e-9 * (frame_ns - before_ns)
+                known = way.covariance if way.covariance.any() else np.diag(sigmas**2)
+                graph.add_edges(frame_ns, [_edge(before_ns, way.T, known)])
                 parts.join(before_ns, frame_ns)
         return graph
 

@@ -178,7 +178,6 @@ def test_a_constant_that_shows_nowhere_leaves_the_other_as_it_is() -> None:
     assert both.score[0] == pytest.approx(alone.score[0])
     assert both.information[0, 0] == pytest.approx(alone.information[0, 0])
     assert not both.information[1].any()
-    assert not both.effects[1].any()
 
 
 def test_the_effect_of_an_error_is_by_how_much_it_moves_the_pose() -> None:

@@ -219,6 +219,22 @@ def test_loops_count_where_odometry_drifts_more_than_it_says() -> None:
     assert np.mean(nees(optimum, drive.truth)) < 20.0
 
 
+def test_frames_that_nothing_connects_with_the_others_are_somewhere() -> None:
+    drive, graph = looped(1, n_links=0), RunGraph()
+    for j, edges in enumerate(drive.edges):
+        if j in (40, 42):  # 41 is measured from 40 alone, and 42 from 39
+            edges = [measured(drive.truth, 39, 42, SIGMAS, drive.rng)] if j == 42 else []
+        estimate = estimate_at(j * PERIOD_NS, drive.truth[j], frame_id=j * PERIOD_NS)
+        graph.add_frame(estimate, edges, is_place=j % 5 == 0)
+    graph.loops = drive.graph.loops
+    optimum = graph.optimize()
+    assert not any(loop.reason for loop in optimum.loops)
+    sigmas_m = np.array([np.sqrt(np.trace(e.covariance[3:, 3:])) for e in optimum.estimates])
+    assert sigmas_m[40:42].min() > 2.0 * np.delete(sigmas_m, [40, 41]).max()
+    others = np.delete(np.arange(len(drive.truth)), [40, 41])
+    assert position_error(poses(optimum)[others], drive.truth[others]) < 0.2
+
+
 def test_covariances_as_stated_are_left_where_loops_agree_with_them() -> None:
     drive = looped(1, n_links=0)
     covariances = np.array([each.covariance for each in drive.graph.optimize().estimates])
