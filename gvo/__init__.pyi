@@ -8,6 +8,7 @@ from gvo.errors import GvoError as GvoError
 from gvo.frontend.protocol import Frontend as Frontend
 from gvo.geometry.camera import PinholeCamera as PinholeCamera
 from gvo.geometry.camera import StereoCamera as StereoCamera
+from gvo.geometry.imu import Imu as Imu
 from gvo.io.convert.convert import convert as convert
 from gvo.io.edges.opening import open_edges as open_edges
 from gvo.io.excerpt import Excerpt as Excerpt

@@ -229,6 +229,46 @@ class WindowConfig(Section):
     )
 
 
+class ImuConfig(Section):
+    """An IMU that carries the camera where it sees nothing."""
+
+    enabled: bool = _common(True, "use the IMU of the recording, if it has one")
+    max_coast_s: float = _common(5.0, "longest time that it carries the camera", "s", ge=0, le=60)
+    delay_ms: float | None = _expert(
+        None,
+        "added to its stamps to get those of images; null: as the recording says, else learnt",
+        "ms",
+    )
+    gyro_noise: float | None = _expert(
+        None,
+        "noise density of the gyro; null: as the recording says",
+        "rad/s/sqrt(Hz)",
+        gt=0,
+        le=10,
+    )
+    gyro_walk: float | None = _expert(
+        None,
+        "random walk of its bias; null: as the recording says",
+        "rad/s^2/sqrt(Hz)",
+        gt=0,
+        le=10,
+    )
+    acceleration_noise: float | None = _expert(
+        None,
+        "noise density of accelerations; null: as the recording says",
+        "m/s^2/sqrt(Hz)",
+        gt=0,
+        le=10,
+    )
+    acceleration_walk: float | None = _expert(
+        None,
+        "random walk of their bias; null: as the recording says",
+        "m/s^3/sqrt(Hz)",
+        gt=0,
+        le=10,
+    )
+
+
 class LoopsConfig(Section):
     """Places seen again, and the global poses."""
 
@@ -264,6 +304,7 @@ class Config(Section):
     ransac: RansacConfig = RansacConfig()
     registration: RegistrationConfig = RegistrationConfig()
     window: WindowConfig = WindowConfig()
+    imu: ImuConfig = ImuConfig()
     loops: LoopsConfig = LoopsConfig()
     runtime: RuntimeConfig = RuntimeConfig()
 

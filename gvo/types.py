@@ -81,9 +81,9 @@ class Status(StrEnum):
     OK = "ok"
     """At least one registration against an earlier frame."""
     COASTING = "coasting"
-    """No registration: the pose continues the last velocity, its covariance inflated."""
+    """No registration: the pose continues the last velocity, or an IMU leads to it."""
     LOST = "lost"
-    """Coasting for more than two seconds."""
+    """Coasting for more than two seconds, without an IMU that led there."""
     RESUMED = "resumed"
     """The first registered frame after coasting or lost ones."""
     SKIPPED = "skipped"
@@ -545,7 +545,7 @@ class Estimate:
         return f"Estimate({format_stamp(self.stamp_ns)} s, ({x}, {y}, {z}) m, {self.status.value})"
 
 
-LinkKind: TypeAlias = Literal["step", "keyframe", "depth"]
+LinkKind: TypeAlias = Literal["step", "keyframe", "depth", "imu"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -556,9 +556,9 @@ class FrameLink:
     ----------
     reference_ns : int
         Stamp of the earlier frame.
-    kind : {"step", "keyframe", "depth"}
+    kind : {"step", "keyframe", "depth", "imu"}
         To the frame that the raw chain goes on from, to a keyframe, to a keyframe by depth alone,
-        or without motion.
+        to the frame before where only the IMU tells how the camera moved since.
     chi2 : float or None
         Squared norm of the whitened residual, of 6 degrees of freedom: about 6 where the stated
         covariances are right; None where the earlier frame left the window with the update.
@@ -650,6 +650,49 @@ class Optimum:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class InertialState:
+    """What the IMU and the camera tell together, at a frame.
+
+    Parameters
+    ----------
+    stamp_ns : int
+    twist : ndarray of float64, shape (6,)
+        Angular velocity and velocity of the frame (of the camera, of a robot) in its own axes,
+        rad/s and m/s.
+    twist_covariance : ndarray of float64, shape (6, 6)
+    up : ndarray of float64, shape (3,)
+        The unit vector against gravity, in the axes of the frame.
+    gyro_bias, acceleration_bias : ndarray of float64, shape (3,)
+        In the axes of the IMU, rad/s and m/s^2.
+    sigmas : ndarray of float64, shape (3,)
+        Of `up` (rad), and of both biases: of the least certain axis of each.
+    """
+
+    stamp_ns: int
+    twist: FloatArray
+    twist_covariance: FloatArray
+    up: FloatArray
+    gyro_bias: FloatArray
+    acceleration_bias: FloatArray
+    sigmas: FloatArray
+
+    def __post_init__(self) -> None:
+        """Copy the arrays."""
+        vectors = dict.fromkeys(("up", "gyro_bias", "acceleration_bias", "sigmas"), (3,))
+        _freeze(self, twist=(6,), twist_covariance=(6, 6), **vectors)
+
+    @property
+    def velocity(self) -> FloatArray:
+        """The velocity (3,) of the frame, m/s."""
+        return self.twist[3:]
+
+    @property
+    def velocity_sigma(self) -> float:
+        """Standard deviation of the velocity along its least certain axis, m/s."""
+        return float(np.sqrt(self.twist_covariance.diagonal()[3:].max()))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrameResult:
     """What one frame gave.
 
@@ -685,6 +728,11 @@ class FrameResult:
     T_map_world : ndarray of float64, shape (4, 4)
         What loops correct the causal pose by, as last optimized while the run goes:
         T_map_world @ T_world_frame.
+    inertial : InertialState or None
+        None without an IMU, and until it has started. Where nothing measured the frame, it is what
+        the IMU predicts.
+    is_carried : bool
+        The IMU led to this frame: nothing else measured it.
     stage_ms : dict of str to float
         Milliseconds by stage.
     """
@@ -707,6 +755,8 @@ class FrameResult:
     loops: tuple[Loop, ...] = ()
     T_previous_frame: FloatArray | None = None
     T_map_world: FloatArray = field(default_factory=lambda: np.eye(4))
+    inertial: InertialState | None = None
+    is_carried: bool = False
     stage_ms: dict[str, float] = field(default_factory=dict)
 
     def __repr__(self) -> str:

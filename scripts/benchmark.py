@@ -1,4 +1,4 @@
-"""Measure errors, cost, loops, pose graphs, the map of a long run, and a running camera.
+"""Measure errors, cost, loops, darkness, pose graphs, the map of a long run, and a running camera.
 
 Each sub-command says by `--help` what it measures and how.
 
@@ -10,7 +10,7 @@ Example: python scripts/benchmark.py cost kitti_06_start --demo --against ../bef
 import argparse
 import sys
 
-from benchmarks import cost, errors, graphs, live, loops, maps  # type: ignore[import-not-found]
+from benchmarks import cost, dark, errors, graphs, live, loops, maps  # type: ignore[import-not-found]
 
 import gvo
 
@@ -18,6 +18,7 @@ COMMANDS = {
     "errors": errors,
     "cost": cost,
     "loops": loops,
+    "dark": dark,
     "graphs": graphs,
     "map": maps,
     "live": live,

@@ -86,13 +86,17 @@ class StatusClock:
         self._measured_ns: int | None = None
         self._has_none = False
 
-    def next(self, stamp_ns: int, *, is_measured: bool) -> Status:
-        """Return the status of the next frame, which a measurement constrains or not."""
+    def next(self, stamp_ns: int, *, is_measured: bool, is_carried: bool = False) -> Status:
+        """Return the status of the next frame, which a measurement constrains or not.
+
+        What carries it, such as an IMU, is none, but keeps it from being lost.
+        """
         had_none, self._has_none = self._has_none, not is_measured
         if is_measured:
             self._measured_ns = stamp_ns
             return Status.RESUMED if had_none else Status.OK
-        self._measured_ns = stamp_ns if self._measured_ns is None else self._measured_ns
+        if is_carried or self._measured_ns is None:
+            self._measured_ns = stamp_ns
         coasting_s = 1e-9 * (stamp_ns - self._measured_ns)
         return Status.LOST if coasting_s > LOST_AFTER_S else Status.COASTING
 

@@ -61,7 +61,8 @@ _FAILURES = RuntimeError, IndexError
 class NewPose:
     """A pose to be put into the window, with the measurements that passed the gate.
 
-    `support` constrains a pose that its measurements do not: the origin, or the last velocity.
+    `support` constrains a pose that its measurements do not: the origin, or the last velocity. With
+    `is_carried` they are one edge, by which the pose goes on unseen.
     """
 
     frame_id: FrameId
@@ -70,13 +71,15 @@ class NewPose:
     measurements: Sequence[Measurement] = ()
     prior: Prior | None = None
     support: Edge | PosePrior | None = None
+    is_carried: bool = False
     rejected: tuple[Rejected, ...] = ()
     n_gated: int = 0
 
     @property
     def is_measured(self) -> bool:
         """Tell whether a measurement constrains the pose, or it is the origin."""
-        return bool(self.measurements) or self.prior is not None or self.support is ORIGIN
+        is_seen = bool(self.measurements) and not self.is_carried
+        return is_seen or self.prior is not None or self.support is ORIGIN
 
 
 @dataclass(slots=True, kw_only=True)

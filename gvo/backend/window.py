@@ -58,7 +58,7 @@ class WindowCounts:
     n_gated : int
         Edges refused because others contradict them.
     n_coasting : int
-        Poses without a usable edge, which continue the last velocity.
+        Poses without a usable edge, which continue the last velocity, or go on by `coasting`.
     n_restored : int
         Updates in which GTSAM failed; the window was restored.
     n_rebuilt : int
@@ -204,6 +204,7 @@ class SlidingWindow:
         prior: Prior | None = None,
         *,
         status: Status | None = None,
+        coasting: Edge | None = None,
     ) -> Estimate:
         """Add a pose, smooth the window, and let poses leave that are neither recent nor kept.
 
@@ -221,6 +222,11 @@ class SlidingWindow:
             identity; with a position alone its rotation starts at the identity, nearly free.
         status : Status, optional
             Of the estimates, if the pose is measured; found by the window if omitted.
+        coasting : Edge, optional
+            How the pose goes on from one in the window if no edge is usable: by an IMU or wheels,
+            say, in place of the last velocity. The pose is coasting then, and never lost. Where two
+            edges contradict each other, it has the casting vote. If it is invalid, it counts for
+            nothing.
 
         Returns
         -------
@@ -235,9 +241,11 @@ class SlidingWindow:
         """
         edges = _as_edges(frame_id, edges)
         self._check_new(frame_id, stamp_ns, edges, prior)
-        new = self._gated(frame_id, int(stamp_ns), edges, prior)
+        carried = None if coasting is None else self._usable(frame_id, coasting)
+        new = self._gated(frame_id, int(stamp_ns), edges, prior, carried)
         new, T_world_frame, covariance = self._insert(new)
-        found = self._clock.next(new.stamp_ns, is_measured=new.is_measured)
+        is_measured, is_carried = new.is_measured, new.is_carried
+        found = self._clock.next(new.stamp_ns, is_measured=is_measured, is_carried=is_carried)
         estimate = Estimate(
             frame_id=frame_id,
             stamp_ns=new.stamp_ns,
@@ -486,8 +494,19 @@ class SlidingWindow:
 
     # What passes the gate
 
+    def _usable(self, frame_id: FrameId, coasting: Edge) -> Prediction | None:
+        """Return the edge that a pose may go on by, if it is valid."""
+        _as_edges(frame_id, [coasting])
+        fault = self._absence(frame_id, coasting) or find_faults([coasting])[0]
+        return None if fault else self._predict(coasting)
+
     def _gated(
-        self, frame_id: FrameId, stamp_ns: int, edges: Sequence[Edge], prior: Prior | None
+        self,
+        frame_id: FrameId,
+        stamp_ns: int,
+        edges: Sequence[Edge],
+        prior: Prior | None,
+        coasting: Prediction | None,
     ) -> NewPose:
         """Return a pose with its valid measurements that pass the gate."""
         refused: list[tuple[Edge | None, str]] = []
@@ -499,7 +518,13 @@ class SlidingWindow:
                 refused.append((edge, fault))
             else:
                 predictions.append(self._predict(edge))
-        gated, support = self._gate(predictions, stamp_ns, prior)
+        if coasting is not None and not predictions:
+            T_world_start, support = coasting.T_world_frame, None
+            if isinstance(prior, PosePrior):
+                T_world_start = gtsam.Pose3(prior.T_world_frame)
+            gated = Gated(T_world_start, [coasting.measurement], [])
+        else:
+            gated, support = self._gate(predictions, stamp_ns, prior, coasting)
         refused += gated.refused
         return NewPose(
             frame_id=frame_id,
@@ -508,12 +533,18 @@ class SlidingWindow:
             measurements=gated.accepted,
             prior=prior,
             support=support,
+            is_carried=coasting is not None
+            and [each.edge for each in gated.accepted] == [coasting.edge],
             rejected=tuple(_refusal(frame_id, stamp_ns, *each) for each in refused),
             n_gated=len(gated.refused),
         )
 
     def _gate(
-        self, predictions: Sequence[Prediction], stamp_ns: int, prior: Prior | None
+        self,
+        predictions: Sequence[Prediction],
+        stamp_ns: int,
+        prior: Prior | None,
+        coasting: Prediction | None,
     ) -> tuple[Gated, Edge | PosePrior | None]:
         """Gate edges against each other; without any, return what constrains the pose instead."""
         if not predictions:
@@ -522,7 +553,7 @@ class SlidingWindow:
         gated = gate_edges(
             predictions,
             relative_covariance=self._graph.relative_covariance,
-            motion=lambda: self._coast(stamp_ns),
+            motion=lambda: coasting or self._coast(stamp_ns),
             gate=self._config.gate,
         )
         return gated, None
@@ -602,6 +633,7 @@ class SlidingWindow:
             measurements=(),
             prior=None,
             support=support,
+            is_carried=False,
             rejected=(*new.rejected, *(_refusal(*ends, edge, reason) for edge in edges)),
         )
 
@@ -635,7 +667,8 @@ class SlidingWindow:
         before, T_world_before = self._motion.measured, None
         if new.measurements and before is not None and before.frame_id in self._poses:
             T_world_before = self._graph.pose(before.frame_id)
-        self._motion.append(estimate, is_measured=new.is_measured, T_world_measured=T_world_before)
+        is_known = new.is_measured or new.is_carried
+        self._motion.append(estimate, is_measured=is_known, T_world_measured=T_world_before)
 
     def _keep_by_distance(self, frame_id: FrameId) -> None:
         T_frame_world = se3.invert(self.pose(frame_id))

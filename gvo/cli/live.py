@@ -181,22 +181,24 @@ def _wait(
     frame: str | None,
 ) -> tuple[Source, BaseFrame]:
     """Wait for the topics of a camera and its calibration; return it with its base frame."""
-    from gvo.io.opening import as_asked
+    from gvo.io.opening import as_asked, asked_imu
     from gvo.io.poses.base_frame import find_base_frame
     from gvo.live.topics import NetworkReader, TopicSource, wait_for
 
     reader = NetworkReader(cast("Transport", network))
+    calibration, imu = asked_imu(options)
 
     def find() -> tuple[TopicSource, BaseFrame]:
-        calibration = options.calibration
-        source = TopicSource(reader, topics=options, calibration=calibration, config=config)
+        source = TopicSource(
+            reader, topics=options, calibration=calibration, config=config, imu=imu
+        )
         return source, find_base_frame(source, frame)
 
     found = wait_for(find, _say, has_signal)
     if found is None:
         raise KeyboardInterrupt
     source, base_frame = found
-    source.info = as_asked(source.info, config, options)
+    source.info = as_asked(source.info, config, options, imu)
     for line in source.info.decisions:
         _say(line)
     return source, base_frame

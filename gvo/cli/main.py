@@ -121,6 +121,9 @@ def run(
         str | None,
         Option(metavar="POSE", help="First pose: X,Y,Z[,QX,QY,QZ,QW] in metres, or truth."),
     ] = None,
+    gravity_aligned: Annotated[
+        bool, Option("--gravity-aligned", help="Turn the world by the IMU so that z points up.")
+    ] = False,
     ground_truth: Annotated[
         str | None,
         Option(metavar="WHAT", help="Pose file, or tf:PARENT:CHILD or /TOPIC in the bag."),
@@ -169,6 +172,7 @@ def run(
             ground_truth=truth,
             base_frame=base_frame,
             starts_at_truth=isinstance(pose, str),
+            gravity_aligned=gravity_aligned,
             excerpt=excerpt,
             outputs=outputs,
             force=force,

@@ -147,6 +147,9 @@ def _recording_options(
     camera_info: Annotated[
         list[str] | None, _topic("CameraInfo: left, then right; or colour, then depth")
     ] = None,
+    imu: Annotated[
+        str | None, Option(metavar="TOPIC", help="Topic of the IMU, or of its gyro; or none.")
+    ] = None,
 ) -> "RecordingOptions":
     from gvo.io.opening import RecordingOptions
 
@@ -156,6 +159,7 @@ def _recording_options(
         rig=rig,
         mask=tuple(mask or ()),
         camera_info=tuple(camera_info or ()),
+        imu=imu,
         **topics,
     )
 

@@ -15,6 +15,11 @@ NO_EFFECTS: Final = np.zeros((6, 1))
 """Of a pose or an edge that shared errors do not move."""
 
 
+def source_ns(edge: Edge) -> int:
+    """Return the stamp that names the reference of an edge."""
+    return int(edge.reference_id)  # type: ignore[call-overload, no-any-return]
+
+
 def then(first: Edge, second: Edge) -> Edge:
     """Return an edge and the independent one that goes on from its end, as one edge.
 

@@ -12,8 +12,9 @@ from gvo.config import Config
 from gvo.errors import RecordingError, named_faults
 from gvo.io.bag.reader import STORAGE_SUFFIXES, is_storage
 from gvo.io.bag.source import BagSource
-from gvo.io.bag.topics import TopicChoice
-from gvo.io.calibration.files import CalibrationPaths
+from gvo.io.bag.topics import NO_IMU, TopicChoice
+from gvo.io.calibration.files import CalibrationPaths, split_imu
+from gvo.io.calibration.forms import ImuFacts
 from gvo.io.datasets.euroc import EurocSource
 from gvo.io.datasets.kitti import KittiSource
 from gvo.io.datasets.tum import TumSource
@@ -30,7 +31,7 @@ _KINDS = (
 FOLDER_MARKERS = ("metadata.yaml", "calib.txt", "times.txt", "mav0", "cam0", "rgb.txt")
 _PACKED = (".gz", ".bz2", ".xz", ".zst", ".zstd", ".lz4", ".zip", ".tar", ".tgz", ".7z")
 _Opened: TypeAlias = BagSource | KittiSource | EurocSource | TumSource
-_TOPICS = ("left", "right", "color", "depth", "camera_info")
+_TOPICS = ("left", "right", "color", "depth", "camera_info", "imu")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,10 +44,13 @@ class RecordingOptions(TopicChoice):
         Topics of a stereo pair in a bag.
     color, depth : str, optional
         Topics of an RGB-D camera in a bag.
+    imu : str, optional
+        Topic of the IMU in a bag, or of its gyro; "none": it is not used.
     camera_info : tuple of str
         Topics of `CameraInfo` in a bag: of left, then right; or of colour, then depth.
     calibration : Path or sequence of Path
-        Files that replace the recording's own calibration: one or two, or a folder.
+        Files that replace the recording's own calibration: one or two, or a folder; and one of
+        the IMU.
     mask : tuple of Path
         Images in which 0 marks pixels that are not used, of the size of those recorded: one for
         both cameras, or left and right; of RGB-D, one for colour.
@@ -92,14 +96,29 @@ def open_recording(
     config = config or Config()
     options = options or RecordingOptions()
     with named_faults(RecordingError, paths[0]):
-        source = _open(paths, config, options)
-    source.info = as_asked(source.info, config, options)
+        calibration, imu = asked_imu(options)
+        source = _open(paths, config, replace(options, calibration=calibration), imu)
+    source.info = as_asked(source.info, config, options, imu)
     return source
 
 
-def as_asked(info: RecordingInfo, config: Config, options: RecordingOptions) -> RecordingInfo:
-    """Return what is known of a recording, with the masks and the rig that are asked for."""
-    return with_rig(_with_masks(info, config, options), options.rig)
+def as_asked(
+    info: RecordingInfo, config: Config, options: RecordingOptions, imu: ImuFacts | None = None
+) -> RecordingInfo:
+    """Return what is known of a recording, with the masks and the rig that are asked for.
+
+    Where facts of an IMU are for nothing it says so.
+    """
+    info = with_rig(_with_masks(info, config, options), options.rig)
+    if imu and info.imu is None:
+        info.decisions.append("imu: none, what is said of one by --calibration is not used")
+    return info
+
+
+def asked_imu(options: RecordingOptions) -> tuple[tuple[Path, ...], ImuFacts | None]:
+    """Return the files of cameras, and what others say of the IMU; None where none is wanted."""
+    calibration, facts = split_imu(options.calibration)
+    return calibration, None if options.imu == NO_IMU else facts
 
 
 def _with_masks(info: RecordingInfo, config: Config, options: RecordingOptions) -> RecordingInfo:
@@ -118,18 +137,21 @@ def _with_masks(info: RecordingInfo, config: Config, options: RecordingOptions) 
     return replace(info, masks=tuple(masks))
 
 
-def _open(paths: Sequence[Path], config: Config, options: RecordingOptions) -> _Opened:
+def _open(
+    paths: Sequence[Path], config: Config, options: RecordingOptions, imu: ImuFacts | None
+) -> _Opened:
     for one in paths:
         if fault := access_fault(one):
             raise RecordingError(f"{one}: {fault}; {_KINDS}")
         if not (one.is_file() or one.is_dir()):
             raise RecordingError(f"{one}: is a pipe, a socket or a device; {_KINDS}")
     if all(is_bag(one) for one in paths):
-        return BagSource(paths, topics=options, calibration=options.calibration, config=config)
+        calibration = options.calibration
+        return BagSource(paths, topics=options, calibration=calibration, config=config, imu=imu)
     if len(paths) > 1:
         other = next(one for one in paths if not is_bag(one))
         raise RecordingError(f"{other}: not a bag; only bags can be combined into one recording")
-    return _open_folder(paths[0], config, options)
+    return _open_folder(paths[0], config, options, imu)
 
 
 def is_bag(path: Path) -> bool:
@@ -144,19 +166,22 @@ def is_bag(path: Path) -> bool:
 def refuse_topics(options: TopicChoice, where: str | Path) -> None:
     """Refuse a choice of topics where there are none."""
     for name in _TOPICS:
-        if getattr(options, name):
+        chosen = getattr(options, name)
+        if chosen and (name, chosen) != ("imu", NO_IMU):
             flag = f"--{name.replace('_', '-')}"
             raise RecordingError(
                 f"{where}: {flag} chooses a topic of a bag or of ROS, here is none"
             )
 
 
-def _open_folder(path: Path, config: Config, options: RecordingOptions) -> _Opened:
+def _open_folder(
+    path: Path, config: Config, options: RecordingOptions, imu: ImuFacts | None
+) -> _Opened:
     refuse_topics(options, path)
     if _is_kitti(path):
         return KittiSource(path, calibration=options.calibration, config=config)
     if (path / "mav0").is_dir() or (path / "cam0").is_dir():
-        return EurocSource(path, calibration=options.calibration, config=config)
+        return EurocSource(path, calibration=options.calibration, config=config, imu=imu)
     if (path / "rgb.txt").is_file():
         return TumSource(path, calibration=options.calibration, config=config)
     raise RecordingError(f"{path}: {_what_is_missing(path) or 'not a recording'}; {_KINDS}")

@@ -13,6 +13,7 @@ from typing import Any, Literal, Protocol
 from numpy.typing import NDArray
 
 from gvo.geometry.camera import Calibration, PinholeCamera, StereoCamera, stereo_camera
+from gvo.geometry.imu import ImuStream
 from gvo.geometry.rig import LearntRig
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, ImageArray
@@ -93,6 +94,8 @@ class RecordingInfo:
         What an earlier run learnt of the camera.
     masks : tuple of ndarray of uint8, shape (h, w)
         Of the raw left and right images, or of the colour images: 0 = not used; empty for none.
+    imu : ImuStream, optional
+        The IMU beside the camera.
     """
 
     name: str
@@ -105,6 +108,7 @@ class RecordingInfo:
     T_body_cam: FloatArray | None = None
     rig: LearntRig | None = None
     masks: tuple[ImageArray, ...] = ()
+    imu: ImuStream | None = None
 
     def __repr__(self) -> str:
         """Return one line: name, sensor, number and size of the images."""

@@ -24,6 +24,7 @@ from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import ChosenImages, Source, StampedImage
 from gvo.io.run_folder.writer import free_path
 from gvo.io.sync import MAX_WAITING_BYTES, Pair, Paired
+from gvo.live.imu import ImuQueue
 from gvo.live.publishing import Arrivals, LiveMessages
 from gvo.live.transport import SET_POSE, TRIGGER, NetworkWriter, Service, Sink
 from gvo.odometry.odometry import Odometry
@@ -124,6 +125,7 @@ class LiveOdometry:
         self.parameters.follow(self._reconfigure)
         left_out = () if with_tf else ("/tf", "/tf_static")
         self._writers = [NetworkWriter(sink, source.info.name, left_out) for sink in sinks]
+        self._imu: ImuQueue | None = getattr(source, "imu_queue", None)
         places = getattr(source, "image_topics", source.info.stream_names)
         self.arrivals = Arrivals(
             *(source.info, places, self._writers, say), n_dropped=lambda: self.n_dropped
@@ -197,6 +199,8 @@ class LiveOdometry:
             outputs = replace(outputs, bag=outputs.bag and free_path(outputs.bag))
             self._say(f"a new run begins in {folder}: {self._stretches.reason}")
             self._base_frame = self._base_frame.restarted()
+            if self._imu is not None:
+                self._imu.restart()
         self._n_dropped += self._waiting.n_dropped
         self._waiting = waiting = self._make_queue()
         if self._is_stopped:
@@ -234,6 +238,8 @@ class LiveOdometry:
             is_robot=not base_frame.is_camera and not base_frame.origin,
         )
         self._loop, self._save = loop, save
+        if (imu := self._imu) is not None and loop.imu_until is not None:
+            loop.imu_until = lambda stamp_ns: imu.until(stamp_ns - loop.imu_delay_ns)
         loop.reconfigure(self.parameters.config)  # it may have changed since the run was begun
         waiting = self._waiting
         loop.waited_s = lambda: waiting.waited_s

@@ -18,15 +18,19 @@ from gvo.io.bag.source import CAMERA_CHANGED, BagSource, ImageStamps
 from gvo.io.bag.topics import (
     CAMERA_INFO_TYPE,
     IMAGE_TYPES,
+    IMU_TYPE,
     CameraTopics,
     Topic,
     TopicChoice,
     describe_topics,
+    find_topic,
 )
 from gvo.io.calibration.files import CalibrationPaths
+from gvo.io.calibration.forms import ImuFacts
 from gvo.io.poses.tf import TF_TYPES, TfBuffer, read_tf
 from gvo.io.recording import StampedImage
 from gvo.io.sync import MAX_WAITING_BYTES
+from gvo.live.imu import N_WAITING, ImuQueue
 from gvo.live.publishing import SILENT_S
 from gvo.live.transport import Transport
 
@@ -40,13 +44,17 @@ _N_KEPT: Final = 100
 _N_WAITING: Final = 300
 _PAUSE_S = 0.2
 _SAID_AFTER = 5
+# For so long after topics appear an IMU, its place and an image to compare its clock with are
+# waited for.
+_IMU_WITHIN_S = 1.0
 _Found = TypeVar("_Found")
 
 
 class NetworkReader:
     """Reads the topics of a network as `BagReader` reads those of a bag.
 
-    It receives `CameraInfo` and transforms from the first `refresh` on, images from `begin` on.
+    It receives `CameraInfo`, transforms and IMUs from the first `refresh` on, images from `begin`
+    on.
 
     Parameters
     ----------
@@ -58,8 +66,6 @@ class NetworkReader:
         Those that others announce.
     n_dropped : int
         Images that were given up because too many waited to be paired.
-    on_small : callable
-        Gets each `CameraInfo` and transform when it comes.
     """
 
     damage = ""
@@ -69,21 +75,49 @@ class NetworkReader:
         self.topics: list[Topic] = []
         self.notes: list[str] = []
         self.n_dropped = 0
-        self.on_small: Callable[[BagMessage], None] = lambda _: None
+        self._on_small: Callable[[BagMessage], None] = lambda _: None
         self._kept: dict[str, deque[BagMessage]] = {}
         self._images: deque[BagMessage] = deque()
         self._changed = threading.Condition()
         self._is_closed = False
+        self._appeared_s = 0.0
 
-    def refresh(self) -> bool:
+    def refresh(self, *, with_imu: bool = False) -> bool:
         """List the topics again; tell whether they are still the same."""
         before = self.topics
         topics = [each for each in self.transport.topics() if not each.name.startswith(_OWN)]
         self.topics = sorted(topics, key=lambda topic: topic.name)
         for topic in self.topics:
-            if topic.type in _SMALL and topic.name not in self._kept:
+            is_small = topic.type in _SMALL or (with_imu and topic.type == IMU_TYPE)
+            if is_small and topic.name not in self._kept:
                 self._subscribe(topic)
+        if self.topics != before:
+            self._appeared_s = time.monotonic()
         return self.topics == before
+
+    def follow(self, names: Collection[str], take: Callable[[BagMessage], None]) -> None:
+        """Give `take` the messages of some topics received so far, then all but images."""
+        with self._changed:
+            for message in self.messages(names):
+                take(message)
+            self._on_small = take
+
+    def await_imu(self, asked: str | None) -> None:
+        """Refuse while nothing came of the IMU asked for; at first while any topic is silent.
+
+        Raises
+        ------
+        RecordingError
+            With what to wait for.
+        """
+        imus = [topic for topic in self.topics if topic.type == IMU_TYPE]
+        chosen = None if asked is None else find_topic(asked, imus)
+        names = [] if chosen is None else [chosen.name]
+        if imus and time.monotonic() - self._appeared_s < _IMU_WITHIN_S:
+            names = [*self._kept]
+        for name in names:
+            if not self._kept[name]:
+                raise RecordingError(f"{self.transport.name}: nothing came on {name}")
 
     def begin(self, topics: CameraTopics) -> None:
         """Receive the images of a camera."""
@@ -91,20 +125,21 @@ class NetworkReader:
             if topic.name not in self._kept:
                 self._subscribe(topic)
 
-    def messages(self, names: Collection[str]) -> Iterator[BagMessage]:
+    def messages(self, names: Collection[str], *, start_ns: int = 0) -> Iterator[BagMessage]:
         """Yield messages received so far: up to a hundred of each topic, one of image topics.
 
         Raises
         ------
         RecordingError
-            If nothing came on a topic that is not tf.
+            If nothing came on a topic that is neither tf nor of an IMU.
         """
         types = {topic.name: topic.type for topic in self.topics}
         for name in names:
-            if not self._kept.get(name) and types.get(name) not in TF_TYPES:
+            if not self._kept.get(name) and types.get(name) not in (*TF_TYPES, IMU_TYPE):
                 raise RecordingError(f"{self.transport.name}: nothing came on {name}")
         with self._changed:
             kept = [message for name in names for message in self._kept[name]]
+        kept = [message for message in kept if message.log_time_ns >= start_ns]
         yield from sorted(kept, key=lambda message: message.log_time_ns)
 
     def images(self) -> Iterator[BagMessage]:
@@ -127,7 +162,8 @@ class NetworkReader:
 
     def _subscribe(self, topic: Topic) -> None:
         is_image = topic.type in IMAGE_TYPES
-        self._kept[topic.name] = deque(maxlen=1 if is_image else _N_KEPT)
+        n_kept = N_WAITING if topic.type == IMU_TYPE else 1 if is_image else _N_KEPT
+        self._kept[topic.name] = deque(maxlen=n_kept)
         channel = Channel(topic.name, topic.type, self.transport.is_ros1)
         take = partial(self._take, channel, is_image=is_image)
         self.transport.subscribe(topic.name, topic.type, take)
@@ -135,12 +171,15 @@ class NetworkReader:
     def _take(self, topic: Channel, data: bytes, stamp_ns: int, *, is_image: bool) -> None:
         message = BagMessage(topic, stamp_ns, data)
         kept = self._kept[topic.name]
+        # Before a simulated clock first ticks, that of an IMU cannot be compared with a camera's.
+        is_timed = stamp_ns > 0 or topic.type not in (IMU_TYPE, *IMAGE_TYPES)
         with self._changed:
             if not is_image:
-                kept.append(message)
-                self.on_small(message)
+                if is_timed:
+                    kept.append(message)
+                    self._on_small(message)
                 return
-            if not kept:
+            if is_timed and not kept:
                 kept.append(message)
             self._images.append(message)
             n_bytes = sum(len(each.data) for each in self._images)
@@ -158,8 +197,13 @@ class TopicSource(BagSource):
     Parameters
     ----------
     reader : NetworkReader
-    topics, calibration, config
+    topics, calibration, config, imu
         As of `BagSource`.
+
+    Attributes
+    ----------
+    imu_queue : ImuQueue or None
+        What comes of the IMU.
 
     Raises
     ------
@@ -174,14 +218,24 @@ class TopicSource(BagSource):
         topics: TopicChoice | None = None,
         calibration: CalibrationPaths = None,
         config: Config | None = None,
+        imu: ImuFacts | None = None,
     ) -> None:
-        is_steady = reader.refresh()
+        is_steady = reader.refresh(with_imu=imu is not None)
         if not is_steady:
             held = describe_topics([each for each in reader.topics if each.type in IMAGE_TYPES])
             raise RecordingError(f"{reader.transport.name}: image topics: {held or 'none'}")
         self._network = reader
         self._name = reader.transport.name
-        self._open(reader, reader.transport.name, topics, calibration, config)
+        found = self._open(reader, reader.transport.name, topics, calibration, config)
+        self.imu_queue: ImuQueue | None = None
+        names = self._info_names
+        if imu is not None:
+            reader.await_imu(topics.imu if topics else None)
+            chosen = self._add_imu(topics, found, {**imu, **found.imu})
+            if chosen is not None:
+                self.imu_queue = ImuQueue(chosen, self._stamp_of)
+                names = names | chosen.names
+        reader.follow(names, self._take_small)
 
     def images(self) -> Iterator[StampedImage]:
         """Yield images as they arrive, until `close`.
@@ -193,9 +247,6 @@ class TopicSource(BagSource):
         """
         stamps = ImageStamps()
         came_s: dict[str, float] = {}
-        for message in self._network.messages(self._info_names):
-            self._watch.take(message)
-        self._network.on_small = self._watch_info
         for message in self._network.images():
             name = message.topic.name
             if name in self.image_topics:
@@ -205,9 +256,11 @@ class TopicSource(BagSource):
             if (silent_s := time.monotonic() - last_s) > SILENT_S:
                 raise RecordingError(f"{name}: no images in the last {silent_s:.0f} s")
 
-    def _watch_info(self, message: BagMessage) -> None:
-        """Compare a `CameraInfo` with the one that is used; say so once where it differs."""
-        if message.topic.name in self._info_names:
+    def _take_small(self, message: BagMessage) -> None:
+        """Compare a `CameraInfo` with the one that is used; keep samples of the IMU."""
+        if self.imu_queue is not None and message.topic.name in self.imu_queue.names:
+            self.imu_queue.put(message)
+        elif message.topic.name in self._info_names:
             was_same = not self.camera_info_changes
             self._watch.take(message)
             if was_same and self.camera_info_changes:

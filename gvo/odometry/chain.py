@@ -10,6 +10,7 @@ from typing import Generic
 import numpy as np
 
 from gvo.backend.factors import find_faults
+from gvo.backend.inertial import InertialEstimator
 from gvo.backend.motion_model import (
     LOST_AFTER_S,
     MAX_EXTRAPOLATION_S,
@@ -43,6 +44,8 @@ _RECENT_S = 1.0
 # normal errors that is 3.4 sigma; fewer changes than so many do not make a median.
 _STEADY = 5.0
 _MIN_CHANGES = 3
+# After so many seconds without a registered frame an IMU knows more than the last velocity.
+_GAP_S = 0.25
 # Registered steps whose errors add up to that of one that was coasted.
 _N_STEPS_COASTED = 1000
 
@@ -109,6 +112,7 @@ class RawChain(Generic[ObservationsT]):
         # The predecessor, and the last registered frame where that is another.
         self._nodes: list[_Node[ObservationsT]] = []
         self._velocity: FloatArray | None = None
+        self._inertial: InertialEstimator | None = None
         # Stamps of the last second, the velocities there, and how they changed from the one before.
         self._recent: list[tuple[int, FloatArray, FloatArray | None]] = []
 
@@ -133,6 +137,7 @@ class RawChain(Generic[ObservationsT]):
         variance_factor: float = 1.0,
         effects_factor: float = 1.0,
         seeks_places: bool = False,
+        inertial: InertialEstimator | None = None,
     ) -> RawStep:
         """Register the next frame and return its step.
 
@@ -149,6 +154,8 @@ class RawChain(Generic[ObservationsT]):
         seeks_places : bool
             A camera that was lost looks for places itself: nothing predicts how far it is from the
             last registered frame, and one registration alone may be of a view that looks alike.
+        inertial : InertialEstimator, optional
+            Predicts frames after a gap.
 
         Raises
         ------
@@ -163,6 +170,7 @@ class RawChain(Generic[ObservationsT]):
         else:
             self._check_stamp(current.stamp_ns)
             factors = variance_factor, effects_factor
+            self._inertial = inertial
             step, anchors = self._follow(current, factors, seeks_places=seeks_places)
         self._nodes = [_Node(frame=frame, observations=current, step=step), *anchors]
         return step
@@ -176,7 +184,11 @@ class RawChain(Generic[ObservationsT]):
         self, current: ObservationsT, factors: tuple[float, float], *, seeks_places: bool
     ) -> tuple[RawStep, list[_Node[ObservationsT]]]:
         """Return the step of a frame, and the last registered frame if it is not this one."""
-        is_lost = seeks_places and self._unregistered_s(current.stamp_ns) > LOST_AFTER_S
+        unmeasured_s = self._unregistered_s(current.stamp_ns)
+        if self._inertial is not None:  # which may have led here since
+            carried_s = 1e-9 * (current.stamp_ns - self._inertial.carried_ns)
+            unmeasured_s = min(unmeasured_s, carried_s)
+        is_lost = seeks_places and unmeasured_s > LOST_AFTER_S
         failures: list[Failure] = []
         for node in self._nodes[: 1 if is_lost else None]:
             result = self._register(node, current)
@@ -194,8 +206,9 @@ class RawChain(Generic[ObservationsT]):
         self, node: _Node[ObservationsT], current: ObservationsT
     ) -> RelativePose | Failure:
         """Search around the predicted pixels, then around the previous ones."""
-        stamp_ns = current.stamp_ns
-        if self._velocity is not None and self._unregistered_s(stamp_ns) <= MAX_EXTRAPOLATION_S:
+        stamp_ns, gap_s = current.stamp_ns, self._unregistered_s(current.stamp_ns)
+        prior = None if self._inertial is None else self._carried(self._inertial, node, stamp_ns)
+        if prior is None and self._velocity is not None and gap_s <= MAX_EXTRAPOLATION_S:
             newest = self._nodes[0].step.estimate
             T_node_newest = se3.invert(node.step.estimate.T_world_frame) @ newest.T_world_frame
             # Outliers do not move the median.
@@ -207,11 +220,25 @@ class RawChain(Generic[ObservationsT]):
                 T_recent=T_node_newest @ T_recent,
                 is_confirmed=len(self._nodes) == 1,
             )
+        if prior is not None:
             result = self._frontend.register(node.observations, current, prior)
             # What contradicts the prediction would be believed without it.
             if isinstance(result, RelativePose | Contradiction):
                 return result
         return self._frontend.register(node.observations, current, None)
+
+    def _carried(
+        self, inertial: InertialEstimator, node: _Node[ObservationsT], stamp_ns: int
+    ) -> MotionPrior | None:
+        """Return what the IMU expects of a frame after a gap; None without one."""
+        is_confirmed = len(self._nodes) == 1
+        if is_confirmed and self._unregistered_s(stamp_ns) <= _GAP_S:
+            return None
+        edge = inertial.carry(node.step.estimate.stamp_ns, stamp_ns)
+        if edge is None:
+            return None
+        T = edge.T_reference_frame
+        return MotionPrior(T_predicted=T, T_recent=T, is_confirmed=is_confirmed)
 
     def _predict(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
         """Return the predicted pose of a frame in its predecessor, and its covariance."""

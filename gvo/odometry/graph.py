@@ -24,9 +24,9 @@ from gvo.backend.factors import ORIGIN
 from gvo.backend.motion_model import SHIFT_SIGMA, TURN_SIGMA
 from gvo.errors import SmoothingError
 from gvo.geometry import se3
-from gvo.geometry.edges import NO_EFFECTS, between, chi2, fuse, inverse, then
-from gvo.odometry.path import Parts, Path, Way, Ways, bent, source_ns
-from gvo.types import Edge, Estimate, FloatArray, Loop, Optimum, PosePrior
+from gvo.geometry.edges import NO_EFFECTS, between, chi2, fuse, inverse, source_ns, then
+from gvo.odometry.path import Parts, Path, Way, Ways, bent
+from gvo.types import Edge, Estimate, FloatArray, Loop, Optimum, PosePrior, Status
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -81,6 +81,8 @@ class RunGraph:
         # Frames of the graph that are no places, oldest first.
         self._passing: deque[int] = deque()
         self._measured_ns = 0
+        # An edge led to a frame that nothing measured: what came after it tells where that was.
+        self._is_bridged = False
         self.loops: Sequence[Loop] = ()
         self.T_map_world: FloatArray = np.eye(4)
         self._running: Future[_Verdict] | None = None
@@ -113,6 +115,7 @@ class RunGraph:
         if edges or len(self.path) == 1:
             self._measured_ns = stamp_ns
         self._connect(estimate, edges)
+        self._is_bridged |= bool(edges) and estimate.status is Status.COASTING
         for edge in edges:
             self._put(stamp_ns, edge)
         if edges and not is_place:
@@ -266,7 +269,8 @@ class RunGraph:
     def optimize(self) -> Optimum:
         """Return the poses that fit all measurements best, loops that contradict the rest apart.
 
-        Without a loop that counts, the poses are those of the path. Nothing is changed by it.
+        Without a loop that counts, or a gap that an IMU led over, the poses are those of the path.
+        Nothing is changed by it.
         Where loops contradict the covariances of odometry, those of the poses are as much larger.
 
         Raises
@@ -282,7 +286,9 @@ class RunGraph:
             replace(each, reason=each.reason or reasons.get(_ends(each), "")) for each in self.loops
         )
         counted = [loop for loop in loops if not loop.reason]
-        estimates, progress = self._fit(counted, ways) if counted else (self.path.estimates(), {})
+        estimates, progress = self.path.estimates(), dict[str, Any]()
+        if counted or self._is_bridged:
+            estimates, progress = self._fit(counted, ways)
         poses = {each.stamp_ns: each.T_world_frame for each in estimates}
         edges = ((frame_ns, edge) for (_, frame_ns), ties in self._edges.items() for edge in ties)
         misfits = [

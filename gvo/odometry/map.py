@@ -8,12 +8,11 @@ from typing import Generic
 from gvo.backend.window import SlidingWindow
 from gvo.config import Config
 from gvo.frontend.protocol import ObservationsT, Recognizer
-from gvo.geometry.edges import inverse, then
+from gvo.geometry.edges import inverse, source_ns, then
 from gvo.odometry.chain import RawStep
 from gvo.odometry.graph import RunGraph
 from gvo.odometry.keyframes import Keyframes
 from gvo.odometry.loops import LoopDetector
-from gvo.odometry.path import source_ns
 from gvo.types import Edge, Estimate, FloatArray, Loop, SegmentJoin, Status
 
 

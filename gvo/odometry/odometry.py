@@ -9,10 +9,12 @@ from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from gvo.backend.inertial import InertialEstimator
 from gvo.backend.keyframe_policy import LINK_GAIN, choose_unseen, is_needed
 from gvo.backend.window import SlidingWindow
-from gvo.config import Config
+from gvo.config import Config, ImuConfig
 from gvo.frontend.depth_icp import DepthTrust
 from gvo.frontend.descriptor import as_stereo
 from gvo.frontend.factory import find_change, frame_of, make_frontend
@@ -20,12 +22,12 @@ from gvo.frontend.offsets import RigOffsets
 from gvo.frontend.protocol import CheckedFrontend, Frontend, count_points
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
-from gvo.geometry.edges import NO_EFFECTS
+from gvo.geometry.edges import NO_EFFECTS, source_ns
+from gvo.geometry.imu import Imu, ImuSamples
 from gvo.odometry.chain import RawChain, RawStep
 from gvo.odometry.graph import RunGraph
 from gvo.odometry.keyframes import Keyframes, judge_links, link_keyframes, misclosure
 from gvo.odometry.map import Map
-from gvo.odometry.path import source_ns
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import (
     Edge,
@@ -39,7 +41,6 @@ from gvo.types import (
     Optimum,
     RelativePose,
     RgbdFrame,
-    SegmentJoin,
     Stamped,
     Status,
     StereoFrame,
@@ -87,6 +88,9 @@ class Odometry:
     config : Config, optional
     frontend : Frontend, optional
         Any object with `extract` and `register`, in place of what `frontend.kind` names.
+    imu : Imu, optional
+        An IMU beside the camera, whose samples `add_imu` takes: it carries the camera where it sees
+        nothing, and changes nothing elsewhere.
 
     Attributes
     ----------
@@ -106,6 +110,7 @@ class Odometry:
         config: Config | None = None,
         *,
         frontend: Frontend[Any] | None = None,
+        imu: Imu | None = None,
     ) -> None:
         self._config = self._next_config = config or Config()
         self._camera = camera
@@ -123,10 +128,17 @@ class Odometry:
         self._is_broken = False  # the raw chain, by a guess
         self._anchor_ns: int | None = None
         self._previous: Estimate | None = None  # by the raw chain
+        self._inertial: InertialEstimator | None = None
+        if imu is not None and self._config.imu.enabled:
+            self._use(imu)
         self._map = Map(self._config, self._frontend.recognizer, self._window, self._keyframes)
         self._trust = DepthTrust()
         self._poses = array("d")  # raw and causal ones, upper three rows
         self.link_gain = LINK_GAIN
+
+    def _use(self, imu: Imu) -> None:
+        known = _with_settings(imu, self._config.imu)
+        self._inertial = InertialEstimator(known, max_coast_s=self._config.imu.max_coast_s)
 
     @property
     def config(self) -> Config:
@@ -157,6 +169,11 @@ class Odometry:
         offsets = self._frontend.rig_offsets
         return offsets if offsets is not None and offsets.learnt else None
 
+    @property
+    def inertial(self) -> InertialEstimator | None:
+        """What is learnt by the IMU, and of it; None without one."""
+        return self._inertial
+
     def reconfigure(self, config: Config) -> None:
         """Change the configuration from the next frame on.
 
@@ -171,6 +188,8 @@ class Odometry:
           `scale_factor` or `upright` of `features` (descriptor): then KLT keyframes, which hold
           their images, are extracted again, and those of descriptors are released.
         - `camera`, `stereo`: what was learnt of the camera is estimated anew.
+        - `imu`: `max_coast_s` with the next frame, and it carries no more once it is not `enabled`;
+          the rest with the next run.
         - `loops`, `runtime`: with the next frame. Where loops were not enabled, places are kept
           from it on.
         - `sync`, `images`, `depth.scale`, `check`: not here, but where frames are read.
@@ -192,6 +211,31 @@ class Odometry:
         if config != self._next_config:
             self._frontend.reconfigure(config)
         self._next_config = config
+
+    def add_imu(self, stamps_ns: ArrayLike, gyro: ArrayLike, acceleration: ArrayLike) -> None:
+        """Take samples of the IMU: all up to the next frame, before it.
+
+        Of one that was not given at construction, how it sits and how late it is are learnt.
+
+        Parameters
+        ----------
+        stamps_ns : array_like of int, shape (n,)
+            By the clock of the IMU, nanoseconds.
+        gyro : array_like of float, shape (n, 3)
+            Angular velocity in the axes of the IMU, rad/s.
+        acceleration : array_like of float, shape (n, 3)
+            Specific force there, m/s^2: at rest 9.81 upwards.
+
+        Raises
+        ------
+        ValueError
+            Where shapes do not fit.
+        """
+        samples = ImuSamples.of(stamps_ns, gyro, acceleration)
+        if self._inertial is None and self._config.imu.enabled:
+            self._use(Imu())
+        if self._inertial is not None:
+            self._inertial.add(samples)
 
     def track(self, frame: Stamped) -> FrameResult:
         """Take the next frame and return its poses.
@@ -215,15 +259,24 @@ class Odometry:
         watch.lap("extract")
         step = self._step(frame, observations)
         watch.lap("register")
-        links = self._link(observations, step)
+        carried = None if self._inertial is None else self._carry(self._inertial, step)
+        links = self._link(observations, step, carried)
         watch.lap("links")
-        causal, T_previous_frame = self._smooth(step, links)
+        causal, T_previous_frame = self._smooth(step, links, carried)
+        if self._inertial is not None:
+            self._tell_inertial(self._inertial, step, causal)
         self._select_keyframes(observations, step, links.scores, causal)
         watch.lap("window")
         joins, loops = self._map.add(observations, causal, links.found, self._chain.anchor)
         watch.lap("loops")
-        poses = causal, T_previous_frame
-        return self._result(observations, step, links.offered, *poses, joins, loops, watch.stage_ms)
+        result = self._result(observations, step, links.offered, causal, watch.stage_ms)
+        return replace(
+            result,
+            joins=joins,
+            loops=loops,
+            T_previous_frame=T_previous_frame,
+            is_carried=carried is not None and causal.status is Status.COASTING,
+        )
 
     def finish(self) -> tuple[Estimate, ...]:
         """Return the smoothed poses of the frames still in the window."""
@@ -280,9 +333,6 @@ class Odometry:
         step: RawStep,
         offered: list[_Offer],
         causal: Estimate,
-        T_previous_frame: FloatArray | None,
-        joins: tuple[SegmentJoin, ...],
-        loops: tuple[Loop, ...],
         stage_ms: dict[str, float],
     ) -> FrameResult:
         n_keypoints, n_points = count_points(observations)
@@ -312,10 +362,8 @@ class Odometry:
             links=judge_links(offered, step.estimate.stamp_ns, self._window),
             keyframes_ns=tuple(self._keyframes.kept),
             segment=self._map.segment,
-            joins=joins,
-            loops=loops,
-            T_previous_frame=T_previous_frame,
             T_map_world=self.T_map_world,
+            inertial=None if self._inertial is None else self._inertial.state,
             stage_ms=stage_ms,
         )
 
@@ -332,6 +380,9 @@ class Odometry:
         if self._camera is not None and not self._is_own:
             self._renew_frontend(former, self._camera)
         self._window.reconfigure(self._config.window)
+        if self._inertial is not None:
+            imu = self._config.imu
+            self._inertial.max_coast_s = imu.max_coast_s if imu.enabled else 0.0
         self._keyframes.camera, self._keyframes.config = self._view(), self._config.window
         self._map.reconfigure(self._config, self._frontend.recognizer)
 
@@ -370,6 +421,7 @@ class Odometry:
             variance_factor=1.0 if offsets is None else offsets.chain_factor.value,
             effects_factor=1.0 if offsets is None else offsets.calibration.size_px,
             seeks_places=self._map.seeks_places,
+            inertial=self._inertial,
         )
         self._map.follow(step)
         if step.failure is not None:  # covariances are what edges state once a pose is a guess
@@ -384,7 +436,38 @@ class Odometry:
             self._window.variance_factor = offsets.window_factor.value
         return step
 
-    def _link(self, observations: _Observations, step: RawStep) -> _Links:
+    def _carry(self, inertial: InertialEstimator, step: RawStep) -> Edge | None:
+        """Return how the IMU says that a frame moved since the one before, if vision does not.
+
+        The first frame after a gap is measured from others: with it, those of the gap follow.
+        """
+        if step.edge is None or self._previous is None:
+            return None
+        previous_ns = self._previous.stamp_ns
+        was_carried = inertial.carried_ns == previous_ns
+        is_followed = source_ns(step.edge) == previous_ns or not was_carried
+        if step.registration is not None and is_followed:
+            return None
+        return inertial.carry(previous_ns, step.estimate.stamp_ns)
+
+    def _tell_inertial(self, inertial: InertialEstimator, step: RawStep, causal: Estimate) -> None:
+        """Let the IMU follow, by poses as they were given out: keyframes keep these from drifting.
+
+        But by the raw step where a gap ends, and the pose is corrected.
+        """
+        edge = step.edge if step.registration is not None else None
+        if edge is not None and causal.status is Status.OK:
+            start = 24 * self._map.graph.path.index(source_ns(edge)) + 12
+            T_world_reference = np.eye(4)
+            T_world_reference[:3] = np.reshape(self._poses[start : start + 12], (3, 4))
+            edge = replace(
+                edge,
+                T_reference_frame=se3.invert(T_world_reference) @ causal.T_world_frame,
+                covariance=self._window.variance_factor * edge.covariance,
+            )
+        inertial.follow(step.estimate.stamp_ns, edge)
+
+    def _link(self, observations: _Observations, step: RawStep, carried: Edge | None) -> _Links:
         """Measure a frame from its predecessor, from keyframes, and after a gap from places."""
         offered: list[_Offer] = []
         # A coasted step is no measurement: the window predicts by itself.
@@ -392,7 +475,7 @@ class Odometry:
             offered.append(("step", step.edge))
         if step.edge is None or step.edge.reference_id not in self._window:  # which would refuse it
             return _Links(scores={}, offered=offered)
-        T_frame_keyframes = self._predict_keyframes(step.edge)
+        T_frame_keyframes = self._predict_keyframes(carried or step.edge)
         scores = self._keyframes.scores(T_frame_keyframes, step.n_steps)
         links = self._link_keyframes(observations, step, scores, T_frame_keyframes)
         offered += [("keyframe", edge) for edge in links]
@@ -401,6 +484,7 @@ class Odometry:
         found = self._map.search(observations, step, links, is_keyframe=is_needed)
         joining = self._map.joining(found)
         offered += [] if joining is None else [("keyframe", joining)]
+        offered += [] if carried is None or not offered else [("imu", carried)]
         return _Links(scores=scores, offered=offered, found=found, is_joining=joining is not None)
 
     def _predict_keyframes(self, edge: Edge) -> dict[int, FloatArray]:
@@ -478,12 +562,18 @@ class Odometry:
         self._map.variance_factor = self._trust.variance_factor
         return edges
 
-    def _smooth(self, step: RawStep, links: _Links) -> tuple[Estimate, FloatArray | None]:
+    def _smooth(
+        self, step: RawStep, links: _Links, carried: Edge | None
+    ) -> tuple[Estimate, FloatArray | None]:
         """Add a frame to the window; return its causal pose, and that in the frame before."""
         raw, offsets = step.estimate, self._frontend.rig_offsets
         edges = [edge for _, edge in links.offered]
         status = Status.RESUMED if links.is_joining else None
-        causal = self._window.add_pose(raw.stamp_ns, raw.stamp_ns, edges, status=status)
+        causal = self._window.add_pose(
+            raw.stamp_ns, raw.stamp_ns, edges, status=status, coasting=carried
+        )
+        if carried is not None and self._inertial is not None and causal.status is Status.COASTING:
+            self._inertial.carried_ns = causal.stamp_ns
         if offsets is not None:
             offsets.window_factor.note(self._window.misfit)
         previous, self._previous = self._previous, raw
@@ -535,6 +625,14 @@ class Odometry:
             self._window.release(previous)
         if self._anchor_ns in self._window:
             self._window.keep(self._anchor_ns)
+
+
+def _with_settings(imu: Imu, config: ImuConfig) -> Imu:
+    """Return an IMU with what is configured of it."""
+    names = "gyro_noise", "gyro_walk", "acceleration_noise", "acceleration_walk"
+    given = {name: getattr(config, name) for name in names}
+    given["delay_s"] = None if config.delay_ms is None else 1e-3 * config.delay_ms
+    return replace(imu, **{name: value for name, value in given.items() if value is not None})
 
 
 def _check_frame(frame: Stamped, camera: StereoCamera | PinholeCamera) -> None:

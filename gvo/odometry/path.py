@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo.geometry import se3
-from gvo.types import BoolArray, Edge, Estimate, FloatArray, IntArray, Status
+from gvo.types import BoolArray, Estimate, FloatArray, IntArray, Status
 
 # Odometry may drift by this share of the way, and by so many radians per metre, without its
 # covariances saying so: what calibration leaves is wrong alike in each step.
@@ -27,11 +27,6 @@ _ROW: Final = np.dtype(
         ("step", "f8", (6, 6)),
     ]
 )
-
-
-def source_ns(edge: Edge) -> int:
-    """Return the stamp that names the reference of an edge."""
-    return int(edge.reference_id)  # type: ignore[call-overload, no-any-return]
 
 
 class Parts:

@@ -13,6 +13,7 @@ import numpy as np
 from gvo.backend.window import SlidingWindow
 from gvo.config import Config
 from gvo.errors import OutputError, RecordingError, SmoothingError
+from gvo.geometry.imu import ImuSamples
 from gvo.io.excerpt import Excerpt
 from gvo.io.frames import Through, frames, is_lost, one_opencv_thread
 from gvo.io.poses.base_frame import BaseFrame
@@ -26,6 +27,10 @@ from gvo.types import Edge, Estimate, FaultyFrame, FloatArray, Frame, FrameResul
 _LOGGER = logging.getLogger(__name__)
 
 _MOST_OFF_NS = 500_000_000
+# Samples are read so far ahead of the frames: an IMU may be late by less.
+_AHEAD_NS = 200_000_000
+# And from so long before the first frame on.
+_BEFORE_NS = 2_000_000_000
 
 
 class Output(Protocol):
@@ -65,6 +70,8 @@ class RunLoop:
     ----------
     excerpt : Excerpt
         Which frames are read.
+    first_pose : callable or None
+        As given; another one may be set before the run.
     statistics : RunStatistics
         Counts so far.
     edges : dict of int to list of (int, Edge)
@@ -72,6 +79,9 @@ class RunLoop:
         the stamp of a frame, and the edge to it from a frame about so much earlier.
     output_faults : list of str
         Why outputs could not be written completely.
+    imu_until : callable or None
+        Yields samples of the IMU up to a stamp of the camera, nanoseconds, and later ones; None
+        where there is no IMU. A running camera has another one than that of a recording.
     waited_s : callable
         Returns how long reading has waited for frames of a running camera so far, seconds.
     on_tracked : callable or None
@@ -92,7 +102,7 @@ class RunLoop:
         self.source, self.config, self.base_frame = source, config, base_frame
         self.statistics = RunStatistics()
         self.excerpt = excerpt or Excerpt()
-        self._first_pose, self._through = first_pose, through
+        self.first_pose, self._through = first_pose, through
         self._read_ms = 0.0
         self._first_ns: int | None = None
         self._previous_ns: int | None = None
@@ -102,7 +112,13 @@ class RunLoop:
         self.output_faults: list[str] = []
         self.waited_s: Callable[[], float] = lambda: 0.0
         self.on_tracked: Callable[[Frame | FaultyFrame, FrameResult | None], None] | None = None
-        self._odometry = Odometry(source.info.camera, config)
+        stream = source.info.imu if config.imu.enabled else None
+        self._odometry = Odometry(
+            source.info.camera, config, imu=None if stream is None else stream.imu
+        )
+        self.imu_until: Callable[[int], Iterator[ImuSamples]] | None = None
+        if stream is not None:
+            self.imu_until = ImuFeed(stream.samples, delay_s=1e-9 * self.imu_delay_ns).until
 
     @property
     def window(self) -> SlidingWindow:
@@ -110,9 +126,15 @@ class RunLoop:
         return self._odometry.window
 
     @property
+    def imu_delay_ns(self) -> int:
+        """What is added to stamps of the IMU, as far as it is known by now."""
+        inertial = self._odometry.inertial
+        return 0 if inertial is None else round(1e9 * (inertial.imu.delay_s or 0.0))
+
+    @property
     def is_placed(self) -> bool:
         """Tell whether the first pose was given, so that it is not the identity."""
-        return self.base_frame.is_placed or self._first_pose is not None
+        return self.base_frame.is_placed or self.first_pose is not None
 
     def run(
         self, outputs: Iterable[Output], on_progress: Callable[[Progress], None] | None
@@ -194,6 +216,7 @@ class RunLoop:
         window = self._odometry.window
         self.statistics.window, self.statistics.batch_result = window.counts, window.batch_result
         self.statistics.rig_offsets = self._odometry.rig_offsets
+        self.statistics.inertial = self._odometry.inertial
         self.statistics.n_guessed = self.base_frame.n_guessed
         self.statistics.mount_travel_m = self.base_frame.mount_travel_m
 
@@ -230,8 +253,9 @@ class RunLoop:
         if isinstance(item, FaultyFrame):
             self._take_faulty(item)
             return
-        if self._first_pose is not None and self.base_frame.first_stamp_ns is None:
-            self.base_frame.start(item.stamp_ns, self._first_pose(item.stamp_ns))
+        if self.first_pose is not None and self.base_frame.first_stamp_ns is None:
+            self.base_frame.start(item.stamp_ns, self.first_pose(item.stamp_ns))
+        self._feed_imu(item.stamp_ns)
         result = self._odometry.track(item)
         result = replace(result, stage_ms={"read": self._read_ms, **result.stage_ms})
         placed = self._placed_result(result)
@@ -242,6 +266,17 @@ class RunLoop:
         self._give(lambda output: output.add_frame(item, placed))
         if self.on_tracked is not None:
             self.on_tracked(item, result)
+
+    def _feed_imu(self, stamp_ns: int) -> None:
+        """Give odometry the samples up to a frame; note where they cannot be read on."""
+        if self.imu_until is None:
+            return
+        try:
+            for samples in self.imu_until(stamp_ns):
+                self._odometry.add_imu(samples.stamps_ns, samples.gyro, samples.acceleration)
+        except RecordingError as error:
+            self.imu_until = None
+            self.statistics.broken_off = str(error)
 
     def discard_files(self) -> None:
         """Give up the bag and the like, which take most of the disk."""
@@ -295,10 +330,43 @@ class RunLoop:
             loops=tuple(map(self.base_frame.apply_to_loop, result.loops)),
             T_previous_frame=step,
             T_map_world=self.base_frame.apply_to_world(result.T_map_world),
+            inertial=self.base_frame.apply_to_inertial(result.inertial),
         )
 
     def _placed(self, estimates: tuple[Estimate, ...]) -> tuple[Estimate, ...]:
         return tuple(self.base_frame.apply(estimate) for estimate in estimates)
+
+
+class ImuFeed:
+    """Hands out the samples of a recording in step with its frames.
+
+    Parameters
+    ----------
+    samples : callable
+        As of `ImuStream`.
+    delay_s : float
+        Of the IMU, as far as it is known.
+    """
+
+    def __init__(
+        self, samples: Callable[[int], Iterator[ImuSamples]], *, delay_s: float = 0.0
+    ) -> None:
+        self._open, self._delay_ns = samples, round(1e9 * delay_s)
+        self._samples: Iterator[ImuSamples] | None = None
+        self._last_ns: int | None = None
+
+    def until(self, stamp_ns: int) -> Iterator[ImuSamples]:
+        """Yield samples until some are later than a stamp of the camera."""
+        stamp_ns -= self._delay_ns
+        if self._samples is None:
+            self._samples = self._open(stamp_ns - _BEFORE_NS)
+        while self._last_ns is None or self._last_ns < stamp_ns + _AHEAD_NS:
+            samples = next(self._samples, None)
+            if samples is None:
+                return
+            if len(samples) > 0:
+                self._last_ns = int(samples.stamps_ns[-1])
+                yield samples
 
 
 def edge_over(window: SlidingWindow, stamp_ns: int, span_ns: int) -> Edge | None:

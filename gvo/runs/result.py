@@ -9,7 +9,7 @@ from typing import Any
 
 from gvo._text import visible
 from gvo.errors import said
-from gvo.io.run_folder.verdict import loop_words, verdict
+from gvo.io.run_folder.verdict import imu_words, loop_words, verdict
 from gvo.trajectory.evaluation import Evaluation, format_evaluations
 
 
@@ -52,7 +52,7 @@ class RunResult:
         if is_smoothed:
             yield from _smoothing_words(summary)
         else:
-            yield from filter(None, [verdict(summary), loop_words(summary)])
+            yield from filter(None, [verdict(summary), loop_words(summary), imu_words(summary)])
 
 
 def _smoothing_words(summary: Mapping[str, Any]) -> Iterator[str]:

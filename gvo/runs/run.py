@@ -24,6 +24,7 @@ from gvo.io.poses.truth import Truth, TruthComparison, initial_pose
 from gvo.io.recording import OTHER_SIZE, Source
 from gvo.io.run_folder.reader import read_estimates, read_run
 from gvo.io.run_folder.writer import GLOBAL, PICTURE, REPORT, RunFolder, save_summary, written_alone
+from gvo.runs.gravity import align_with_gravity
 from gvo.runs.loop import Output, RunLoop, motions_of_window
 from gvo.runs.outputs.file import FileOutput
 from gvo.runs.outputs.options import RunOutputs
@@ -47,6 +48,7 @@ def run_recording(
     ground_truth: Trajectory | Truth | None = None,
     base_frame: BaseFrame | None = None,
     starts_at_truth: bool = False,
+    gravity_aligned: bool = False,
     excerpt: Excerpt | None = None,
     outputs: RunOutputs | None = None,
     force: bool = False,
@@ -71,6 +73,8 @@ def run_recording(
         at the identity.
     starts_at_truth : bool
         Start at the true pose of the first frame.
+    gravity_aligned : bool
+        Turn the world so that z points up, by the IMU; the first position and heading stay.
     excerpt : Excerpt, optional
         The frames to read; all if omitted.
     outputs : RunOutputs, optional
@@ -95,6 +99,8 @@ def run_recording(
 
     Raises
     ------
+    ConfigurationError
+        If the recording has no IMU, where the world is to be aligned with gravity.
     RecordingError
         If no frame is usable.
     OutputError
@@ -114,6 +120,9 @@ def run_recording(
     loop = RunLoop(
         *(source, config, base_frame), excerpt=excerpt, first_pose=first_pose, through=through
     )
+    if gravity_aligned:
+        identity["output"]["z is up"] = True
+        align_with_gravity(loop, on_progress)
     with ExitStack() as stack, ExitStack() as files:
         stack.enter_context(written_alone(Path(out), force=force))
         others = outputs.open(loop, files)

@@ -11,10 +11,19 @@ from typing import Any
 import numpy as np
 
 from gvo.backend.batch import BatchResult
+from gvo.backend.inertial import InertialEstimator
 from gvo.backend.window import WindowCounts
 from gvo.frontend.offsets import RigOffsets
 from gvo.frontend.zoom import HARDEST_MPS2
-from gvo.types import Estimate, FaultyFrame, FrameResult, Progress, SegmentJoin, Status
+from gvo.types import (
+    Estimate,
+    FaultyFrame,
+    FrameResult,
+    InertialState,
+    Progress,
+    SegmentJoin,
+    Status,
+)
 
 # A run with a larger share of untracked poses is not complete.
 _MAX_UNTRACKED_SHARE = 0.1
@@ -39,7 +48,10 @@ class Segment:
 
 @dataclass(slots=True, kw_only=True)
 class RunStatistics:
-    """Counts, times and segments of a run."""
+    """Counts, times and segments of a run.
+
+    `gaps_s` are the times for which an IMU led the camera, one after the other.
+    """
 
     statuses: Counter[Status] = field(default_factory=Counter)
     first_fault: str = ""
@@ -52,10 +64,15 @@ class RunStatistics:
     window: WindowCounts = field(default_factory=WindowCounts)
     batch_result: BatchResult | None = None
     rig_offsets: RigOffsets | None = None
+    inertial: InertialEstimator | None = None
+    inertial_state: InertialState | None = None
+    n_carried: int = 0
+    gaps_s: list[float] = field(default_factory=list)
     stages: dict[str, array[float]] = field(default_factory=dict)
     segments: dict[int, Segment] = field(default_factory=dict)
     standstill: dict[str, float] | None = None
     _raws: list[Estimate] = field(default_factory=list)
+    _last: FrameResult | None = None
 
     @property
     def n_frames(self) -> int:
@@ -71,6 +88,11 @@ class RunStatistics:
     def n_with_pose(self) -> int:
         """Frames that have a pose."""
         return self.n_frames - self.statuses[Status.SKIPPED]
+
+    @property
+    def n_made_up(self) -> int:
+        """Frames whose pose rests on nothing but the last velocity."""
+        return self.n_with_pose - self.n_tracked - self.n_carried
 
     @property
     def n_faulty(self) -> int:
@@ -109,8 +131,7 @@ class RunStatistics:
     @property
     def is_complete(self) -> bool:
         """Tell whether no frame is missing, and all but a few are tracked."""
-        n_untracked = self.n_with_pose - self.n_tracked
-        is_tracked = n_untracked <= _MAX_UNTRACKED_SHARE * self.n_with_pose
+        is_tracked = self.n_made_up <= _MAX_UNTRACKED_SHARE * self.n_with_pose
         is_tracked &= self.n_with_pose < 2 or self.n_tracked >= 2
         is_whole = not (self.n_faulty or self.broken_off or self.statuses[Status.LOST])
         return is_whole and is_tracked
@@ -125,6 +146,7 @@ class RunStatistics:
         self.statuses[result.status] += 1
         self._add_to_segment(result)
         self._look_for_standstill(result.raw)
+        self._follow_imu(result)
         for join in result.joins:
             self._join(join)
         self.first_untracked = self.first_untracked or result.reason
@@ -138,6 +160,15 @@ class RunStatistics:
         segment.last_stamp_ns = stamp_ns
         segment.n_frames += 1
         segment.n_tracked += result.status in (Status.OK, Status.RESUMED)
+
+    def _follow_imu(self, result: FrameResult) -> None:
+        self.inertial_state = result.inertial or self.inertial_state
+        last, self._last = self._last, result
+        if last is not None and result.is_carried:
+            self.n_carried += 1
+            if not last.is_carried:
+                self.gaps_s.append(0.0)
+            self.gaps_s[-1] += 1e-9 * (result.stamp_ns - last.stamp_ns)
 
     def _look_for_standstill(self, raw: Estimate) -> None:
         """Tell images that stand still after two steps at a speed that no brake takes away."""
@@ -209,17 +240,16 @@ class RunStatistics:
         yield from self._warnings_of_window()
 
     def _warnings_of_poses(self) -> Iterator[str]:
-        n_untracked = self.n_with_pose - self.n_tracked
-        if n_untracked and self.n_tracked < 2:
+        if self.n_made_up and self.n_tracked < 2:
             yield (
                 "no frame could be registered against another (are left and right exchanged, is "
                 "the calibration or depth.scale wrong, are the images dark?); the first: "
                 f"{self.first_untracked}"
             )
-        elif n_untracked:
+        elif self.n_made_up:
             yield (
-                f"{n_untracked} of {self.n_with_pose} poses continue the last velocity, without a "
-                "registration (frames.csv: coasting, lost)"
+                f"{self.n_made_up} of {self.n_with_pose} poses continue the last velocity, without "
+                "a registration (frames.csv: coasting, lost)"
             )
         if self.mount_travel_m > _MAX_MOUNT_TRAVEL_M:
             yield (

@@ -18,6 +18,7 @@ import numpy as np
 
 from gvo._version import __version__
 from gvo.errors import GvoError, OutputError
+from gvo.geometry.imu import ImuStream
 from gvo.io.excerpt import Excerpt
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.poses.truth import TruthComparison
@@ -30,6 +31,7 @@ from gvo.types import Failure, Optimum, Progress
 
 if TYPE_CHECKING:
     from gvo.runs.loop import RunLoop
+    from gvo.runs.statistics import RunStatistics
 
 State: TypeAlias = Literal["running", "interrupted", "complete"]
 
@@ -54,6 +56,7 @@ def summarize(
         "base_frame": ", ".join(filter(None, (frame.name or "camera", frame.origin))),
         **_truth_json(compared),
         **loop.statistics.as_json(),
+        **_imu_json(info.imu, loop.statistics),
         "rig": None if learnt is None else rig_json(info.camera, learnt),
         "peak_memory_mb": round(peak_memory_mb(), 1),
         "warnings": warnings,
@@ -72,6 +75,32 @@ def _truth_json(compared: TruthComparison | Failure) -> dict[str, Any]:
         "ground_truth_stamps_from": truth.trajectory.stamps_from,
         "errors": evaluations_json(compared.evaluations)["estimates"],
     }
+
+
+def _imu_json(stream: ImuStream | None, statistics: RunStatistics) -> dict[str, Any]:
+    """Return what `summary.json` holds of an IMU; nothing where none is used."""
+    inertial, state, gaps_s = statistics.inertial, statistics.inertial_state, statistics.gaps_s
+    if stream is None or inertial is None:
+        return {}
+    T, delay_s = inertial.imu.T_camera_imu, inertial.imu.delay_s
+    has_failed = state is None or inertial.n_restarts > 0
+    found = {
+        "name": stream.name,
+        "has_started": state is not None,
+        "n_carried": statistics.n_carried,
+        "carried_s": round(sum(gaps_s, 0.0), 3),
+        "n_gaps": len(gaps_s),
+        "longest_s": round(max(gaps_s, default=0.0), 3),
+        "n_restarts": inertial.n_restarts,
+        "reason": inertial.reason if has_failed else "",
+        "T_camera_imu": None if T is None else T.tolist(),
+        "is_rotation_learnt": stream.imu.T_camera_imu is None and T is not None,
+        "delay_ms": None if delay_s is None else 1e3 * delay_s,
+        "is_delay_learnt": stream.imu.delay_s is None and delay_s is not None,
+        "gyro_bias": None if state is None else state.gyro_bias.tolist(),
+        "acceleration_bias": None if state is None else state.acceleration_bias.tolist(),
+    }
+    return {"imu": found}
 
 
 def optimum_json(optimum: Optimum | None) -> dict[str, Any] | None:

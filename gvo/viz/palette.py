@@ -24,7 +24,7 @@ STATUSES = {
 }
 """Of the statuses of frames, which have hatches and rows of their own too."""
 HATCHES = {"ok": "", "coasting": "////", "lost": "xxxx", "resumed": "....", "skipped": ""}
-LINKS = {"step": "#0072B2", "keyframe": "#CC79A7", "depth": "#009E73"}
+LINKS = {"step": "#0072B2", "keyframe": "#CC79A7", "depth": "#009E73", "imu": "#8C564B"}
 """Of the kinds of edges."""
 REFUSED = "#D55E00"
 STAGES = {
@@ -74,6 +74,7 @@ DRAWN = {
     "step": LINKS["step"],
     "keyframe link": LINKS["keyframe"],
     "depth": LINKS["depth"],
+    "imu": LINKS["imu"],
     "refused": REFUSED,
     "loops": ESTIMATES["global"],
     "ellipsoids": OTHERS[3],

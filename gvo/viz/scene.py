@@ -216,7 +216,7 @@ class Scene:
     paths : dict of str to Path
         Where a full second of the recording begins, each of at most 500 poses; else none.
     lines : dict of str to ndarray of float64, shape (n, 2, 3)
-        Links of the frame by kind ("step", "keyframe link", "depth") or "refused",
+        Links of the frame by kind ("step", "keyframe link", "depth", "imu") or "refused",
         and its "loops", metres.
     points : Points
     counts, stage_ms, chi2 : dict of str to number

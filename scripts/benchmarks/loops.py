@@ -139,7 +139,7 @@ def drifting(source: Source, drift: float) -> Source:
     return FaultySource(source, Breathing(amount=0.012 * drift)) if drift else source
 
 
-def darkened(source: Source, dark_s: tuple[float, float]) -> Source:
+def darkened(source: Source, dark_s: tuple[float, float]) -> FaultySource:
     """Return the recording, black from when to when."""
     stamps_ns = [image.stamp_ns for image in source.images() if image.stream == 0]
     since_s = 1e-9 * (np.array(stamps_ns) - stamps_ns[0])

@@ -5,11 +5,12 @@ import sys
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import gvo
 from gvo.io.recording import Sensor, Source
-from gvo.io.synthetic import RigError
+from gvo.io.synthetic import ImuKind, RigError, rendered_imu
+from gvo.runs.loop import ImuFeed
 from gvo.types import Frame
 
 sys.path.append(str(Path(__file__).parents[2]))  # for the worlds of the tests
@@ -53,6 +54,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--readout", type=float, default=0.0, metavar="MS", help="rolling shutter")
     group.add_argument("--bent", type=float, default=0.0, metavar="PX", help="error of the rig")
     group.add_argument("--others", action="store_true", help="also of what is not considered")
+    group.add_argument("--imu", choices=get_args(ImuKind), help="beside the camera")
     group.add_argument("--keep", type=Path, metavar="DIR", help="of bags, written once, then read")
 
 
@@ -88,22 +90,18 @@ def named(arguments: argparse.Namespace) -> Iterator[Source]:
 def of_seed(arguments: argparse.Namespace, seed: int) -> Source:
     """Return the rendered recording of a seed, kept as a bag where that is asked for."""
     kind = KINDS[arguments.kind]
-    sensor, n_frames = arguments.sensor or kind.sensor, arguments.frames or kind.n_frames
-    scale, readout_ms = arguments.scale or kind.scale, arguments.readout
+    sensor, options = arguments.sensor or kind.sensor, options_of(arguments, seed)
 
     def render() -> Source:
-        options = {"n_frames": n_frames, "scale": scale, "readout_ms": readout_ms, "seed": seed}
         try:
-            if size_px := arguments.bent:
-                bent = RigError(size_px=size_px, seed=seed, others=arguments.others)
-                return rendered(kind.world, sensor, **options, rig_error=bent)
             return rendered(kind.world, sensor, **options)
         except ValueError as error:
             raise gvo.GvoError(f"{arguments.kind}: {error}") from error
 
     if arguments.keep is None:
         return render()
-    name = f"{arguments.kind}-{sensor}-{n_frames}-{scale:g}x-{readout_ms:g}ms-{seed}"
+    name = f"{arguments.kind}-{sensor}-{options['n_frames']}-{options['scale']:g}x"
+    name += f"-{arguments.readout:g}ms-{seed}" + f"-{arguments.imu}" * (arguments.imu is not None)
     if arguments.bent:
         name += f"-bent-{arguments.bent:g}px" + "-others" * arguments.others
     path: Path = arguments.keep / f"{name}.mcap"
@@ -114,6 +112,22 @@ def of_seed(arguments: argparse.Namespace, seed: int) -> Source:
             raise gvo.GvoError(f"{path}: cannot be written: {error.strerror}") from error
         gvo.convert(render(), path)
     return gvo.open_recording(path)
+
+
+def options_of(arguments: argparse.Namespace, seed: int) -> dict[str, Any]:
+    """Return how a seed is rendered."""
+    kind = KINDS[arguments.kind]
+    options: dict[str, Any] = {
+        "n_frames": arguments.frames or kind.n_frames,
+        "scale": arguments.scale or kind.scale,
+        "readout_ms": arguments.readout,
+        "seed": seed,
+    }
+    if size_px := arguments.bent:
+        options["rig_error"] = RigError(size_px=size_px, seed=seed, others=arguments.others)
+    if arguments.imu is not None:
+        options["imu"] = rendered_imu(arguments.imu)
+    return options
 
 
 def truth_of(source: Source) -> gvo.Trajectory:
@@ -132,14 +146,21 @@ def usable_frames(source: Source, config: gvo.Config) -> Iterator[Frame]:
 class Run:
     """Odometry over a recording, from its first frame or a later one on."""
 
-    def __init__(self, source: Source, config: gvo.Config, *, first: int = 0) -> None:
+    def __init__(
+        self, source: Source, config: gvo.Config, *, first: int = 0, has_imu: bool = False
+    ) -> None:
         self.source, self.config, self.first = source, config, first
-        self.odometry = gvo.Odometry(source.info.camera, config)
+        stream = source.info.imu if has_imu else None
+        imu = None if stream is None else stream.imu
+        self.odometry = gvo.Odometry(source.info.camera, config, imu=imu)
+        self.samples = ImuFeed((lambda _: iter(())) if stream is None else stream.samples)
         self.results: list[gvo.FrameResult] = []
 
     def track(self) -> Iterator[gvo.FrameResult]:
         """Track frame after frame; yield what each gave."""
         for frame in islice(usable_frames(self.source, self.config), self.first, None):
+            for samples in self.samples.until(frame.stamp_ns):
+                self.odometry.add_imu(samples.stamps_ns, samples.gyro, samples.acceleration)
             self.results.append(self.odometry.track(frame))
             yield self.results[-1]
         if not self.results:

@@ -2,8 +2,9 @@
 
 Example: rosparam set use_sim_time true; gvo live ros1 & python scripts/ros/play.py RECORDING
 
-Any recording that gvo reads is sent as `gvo convert` would write it: images, their CameraInfo and
-how the cameras sit, and `/clock` before each image, as soon as somebody listens to both cameras.
+Any recording that gvo reads is sent as `gvo convert` would write it: images, their CameraInfo, how
+the cameras sit, the samples of an IMU up to 0.2 s ahead, and `/clock` before each image, as soon as
+somebody listens to both cameras.
 Without --rate at most --ahead pairs are on their way: the next one is sent when the odometry of an
 earlier one has come, so that nothing is dropped however slow the machine is.
 """
@@ -26,17 +27,21 @@ import rospy
 
 import gvo
 from gvo.config import SyncConfig
-from gvo.io.bag.topics import IMAGE_TYPE
-from gvo.io.convert.bag import BagStream, BagStreams, plan_streams, static_poses
+from gvo.geometry.imu import ImuSamples
+from gvo.io.bag.topics import IMAGE_TYPE, IMU_TYPE
+from gvo.io.convert.bag import IMU_FRAME, BagStream, BagStreams, plan_streams, static_poses
 from gvo.io.convert.bag_messages import (
     Header,
+    ImuSample,
     MessageWriter,
     write_camera_info,
     write_image,
+    write_imu,
     write_transforms,
 )
 from gvo.io.frames import paired
 from gvo.io.recording import Source, StampedImage
+from gvo.runs.loop import ImuFeed
 from gvo.types import FaultyFrame
 
 PATIENCE_S = 60.0
@@ -86,11 +91,15 @@ class Writer(MessageWriter):
         publisher.publish(publisher.data_class().deserialize(self.serialize(message, type_)))
 
     def send(self, image: StampedImage, stream: BagStream) -> None:
-        """Set the clock, and publish an image and its CameraInfo."""
+        """Publish an image and its CameraInfo."""
         header = Header(image.stamp_ns, stream.frame_id)
-        self.tick(image.stamp_ns)
         write_camera_info(self, stream.info_topic, stream.calibration, header)
         write_image(self, stream.topic, image.load(), header)
+
+    def send_samples(self, samples: ImuSamples) -> None:
+        """Publish samples of the IMU."""
+        for row in zip(samples.stamps_ns.tolist(), samples.gyro, samples.acceleration, strict=True):
+            write_imu(self, "/imu", ImuSample(*row), IMU_FRAME)
 
     def tick(self, stamp_ns: int) -> None:
         """Set the clock."""
@@ -159,6 +168,8 @@ def play(source: Source, answers: Answers, rate: float | None, n_ahead: int) -> 
     first_ns, n_pairs = min(map(min, pairs)), len(pairs)
     writer, streams = Writer(), plan_streams(source, rectify=False)
     introduce(source, streams, writer, first_ns)
+    imu = source.info.imu
+    feed = ImuFeed((lambda _: iter(())) if imu is None else imu.samples)
     begin_s = time.monotonic()
     sent: set[tuple[int, int]] = set()
     awaited: list[int] = []
@@ -166,6 +177,9 @@ def play(source: Source, answers: Answers, rate: float | None, n_ahead: int) -> 
         if rate:
             due_s = begin_s + 1e-9 * (image.stamp_ns - first_ns) / rate
             time.sleep(max(due_s - time.monotonic(), 0.0))
+        writer.tick(image.stamp_ns)
+        for samples in feed.until(image.stamp_ns):
+            writer.send_samples(samples)
         writer.send(image, streams[image.stream])
         sent.add((image.stream, image.stamp_ns))
         while pairs and {(0, pairs[0][0]), (1, pairs[0][1])} <= sent:
@@ -187,6 +201,8 @@ def introduce(source: Source, streams: BagStreams, writer: Writer, stamp_ns: int
     poses = static_poses(source, frame_ids, stamp_ns)
     write_transforms(writer, "/tf_static", poses, is_latched=True)
     made = [writer.open(stream.topic, IMAGE_TYPE) for stream in streams]
+    if source.info.imu is not None:
+        made.append(writer.open("/imu", IMU_TYPE))
     for stream in streams:
         write_camera_info(
             writer, stream.info_topic, stream.calibration, Header(stamp_ns, stream.frame_id)

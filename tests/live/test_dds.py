@@ -1,5 +1,6 @@
 """ROS 2's topics and services over DDS, against plain CycloneDDS in another process."""
 
+import json
 import os
 import queue
 import signal
@@ -24,6 +25,7 @@ pytest.importorskip("cyclonedds")
 from gvo.live.dds import Dds, sockets
 from tests.conftest import GVO, Command, assert_same_files, refused, run_of
 from tests.live.pipe import Program
+from tests.make.blind_walk import BLIND, blind_walk
 
 pytestmark = pytest.mark.dds
 
@@ -61,6 +63,10 @@ Point = struct("geometry_msgs", "Point", x=float64, y=float64, z=float64)
 Quaternion = struct("geometry_msgs", "Quaternion", x=float64, y=float64, z=float64, w=float64)
 Pose = struct("geometry_msgs", "Pose", position=Point, orientation=Quaternion)
 Twist = struct("geometry_msgs", "Twist", linear=Vector3, angular=Vector3)
+Imu = struct("sensor_msgs", "Imu", header=Header,
+    orientation=Quaternion, orientation_covariance=array[float64, 9],
+    angular_velocity=Vector3, angular_velocity_covariance=array[float64, 9],
+    linear_acceleration=Vector3, linear_acceleration_covariance=array[float64, 9])
 CovariantPose = struct(
     "geometry_msgs", "PoseWithCovariance", pose=Pose, covariance=array[float64, 36])
 CovariantTwist = struct(
@@ -311,7 +317,8 @@ def test_a_domain_that_cannot_be_joined_is_told(
     assert "expected a number from 0 to 232, got 233" in said
 
 
-# Plays a bag: each pair once the pose of the last has come, with all transforms of its stamp.
+# Plays a bag: each pair once the pose of the last has come, with all transforms of its stamp, and
+# after the samples of an IMU up to 10 ms later.
 PLAYER = """
 from pathlib import Path
 from gvo.io.bag.reader import BagReader
@@ -321,25 +328,36 @@ def raw(type_, data):
     sample.serialize = lambda **_: data
     return sample
 
-types = {"Image": Image, "CameraInfo": CameraInfo}
+types = {"Image": Image, "CameraInfo": CameraInfo, "Imu": Imu, "TFMessage": Transforms}
+held = CameraInfo, Transforms
 bag = BagReader(Path(BAG))
 kinds = {topic.name: types[topic.type.rpartition("/")[2]] for topic in bag.topics if
-         topic.type.startswith("sensor_msgs")}
-writers = {name: writer("rt" + name, type_, RELIABLE, *([HELD] if type_ is CameraInfo else []))
+         topic.name != "/tf"}
+writers = {name: writer("rt" + name, type_, RELIABLE, *([HELD] if type_ in held else []))
            for name, type_ in kinds.items()}
 messages = [*bag.messages(kinds)]
 for name, type_ in kinds.items():
-    if type_ is CameraInfo:
+    if type_ in held:
         first = next(each for each in messages if each.topic.name == name)
         writers[name].write(raw(type_, first.data))
 answers = reader("rt/gvo/odom/odometry", Odometry, RELIABLE)
 moves = DataReader(PARTICIPANT, Topic(PARTICIPANT, "rt/tf", Transforms),
     Qos(RELIABLE, Policy.History.KeepLast(1000)))
 images = [each for each in messages if kinds[each.topic.name] is Image]
+samples = [each for each in messages if kinds[each.topic.name] is Imu]
 outs = [writers[name] for name in {each.topic.name for each in images}]
-wait(lambda: all(out.matched_sub for out in outs) and answers.matched_pub and moves.matched_pub)
+
+def is_joined():
+    for each in samples[:1]:  # so that it is not silent
+        writers[each.topic.name].write(raw(Imu, each.data))
+    return all(out.matched_sub for out in outs) and answers.matched_pub and moves.matched_pub
+
+wait(is_joined)
 stamps = []
 for first, second in zip(images[::2], images[1::2], strict=True):
+    while samples and samples[0].log_time_ns < first.log_time_ns + 10_000_000:
+        each = samples.pop(0)
+        writers[each.topic.name].write(raw(Imu, each.data))
     for each in (first, second):
         writers[each.topic.name].write(raw(Image, each.data))
     answer = answers.take_one(timeout=duration(seconds=60))
@@ -352,6 +370,23 @@ say(moved == stamps)
 """
 
 
+class LiveRos2:
+    """`gvo live ros2` that tracks what a peer plays; interrupted at the end."""
+
+    def __init__(self, bag: Path, out: Path, peer: Callable[[str], Peer], *options: str) -> None:
+        words = ["--qos", "reliable", "--out", str(out), "--no-report", *options]
+        with subprocess.Popen(
+            [*GVO, "live", "ros2", *words], stderr=subprocess.PIPE, text=True
+        ) as live:
+            try:
+                player = peer(f"BAG = {str(bag)!r}\n{PLAYER}")
+                self.lines = [player.line(), player.line()]
+            finally:
+                live.send_signal(signal.SIGINT)
+                _, self.errors = live.communicate(timeout=HOLD_S)
+        assert live.returncode == 0, self.errors
+
+
 @pytest.mark.recorded
 @pytest.mark.acceptance
 def test_a_drive_that_another_program_plays_is_tracked_as_in_its_bag(
@@ -360,15 +395,18 @@ def test_a_drive_that_another_program_plays_is_tracked_as_in_its_bag(
     bag = tmp_path / "drive.mcap"
     gvo.convert(gvo.open_recording(gvo_data / "kitti_06_start"), bag)
     run_of(bag, tmp_path / "run")
-    options = ["--qos", "reliable", "--out", str(tmp_path / "live"), "--no-report"]
-    command = [*GVO, "live", "ros2", *options]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as live:
-        try:
-            player = peer(f"BAG = {str(bag)!r}\n{PLAYER}")
-            assert player.line() == "51 gvo/odom gvo/odom/camera_left_optical"
-            assert player.line() == "True"
-        finally:
-            live.send_signal(signal.SIGINT)
-            _, errors = live.communicate(timeout=HOLD_S)
-    assert live.returncode == 0, errors
+    live = LiveRos2(bag, tmp_path / "live", peer)
+    assert live.lines == ["51 gvo/odom gvo/odom/camera_left_optical", "True"]
     assert_same_files(tmp_path / "live", tmp_path / "run")
+
+
+@pytest.mark.acceptance
+def test_an_imu_that_another_program_plays_carries_the_camera_through_the_dark(
+    domain: int, tmp_path: Path, peer: Callable[[str], Peer]
+) -> None:
+    bag = tmp_path / "walk.mcap"
+    gvo.convert(blind_walk(), bag)
+    live = LiveRos2(bag, tmp_path / "live", peer, "--set", "imu.delay_ms=0")
+    assert "imu: /imu (1 messages); placed by tf " in live.errors
+    told = json.loads((tmp_path / "live" / "summary.json").read_text())["imu"]
+    assert (told["n_carried"], told["n_restarts"]) == (len(BLIND), 0)

@@ -15,7 +15,8 @@ from gvo.config import list_parameters
 from gvo.types import FloatArray
 from tests.conftest import GVO, assert_same_files, python, refused, run_of
 from tests.live.pipe import PATIENCE_S, Program
-from tests.live.ros1 import Ros
+from tests.live.ros1 import Ros, master
+from tests.make.blind_walk import BLIND, blind_walk
 
 pytestmark = pytest.mark.ros1
 
@@ -91,6 +92,22 @@ def test_what_is_played_is_tracked_as_from_its_files(
         points_cam = rows[:, :12].copy().view("<f4")
         assert np.all(points_cam[:, 2] > 0.1)  # the camera looks along z
         np.testing.assert_allclose(transforms.to_map(frame, stamp_ns), poses[stamp_ns], atol=1e-6)
+
+
+@pytest.mark.acceptance
+def test_an_imu_that_is_played_carries_the_camera_through_the_dark(tmp_path: Path) -> None:
+    gvo.convert(blind_walk(), tmp_path / "walk.bag")
+    out = tmp_path / "out"
+    with master(tmp_path) as ros:
+        ros.use_simulated_clock()
+        odometry = live(ros, out, "--imu", "imu", "--set", "imu.delay_ms=0")
+        player = ros.start(PLAYER, tmp_path / "walk.bag")
+        player.wait_for("pairs sent")
+        assert player.end() == 0
+        assert odometry.interrupt() == 0, odometry.errors
+    odometry.wait_for("imu: /imu (1 messages); placed by tf")
+    told = json.loads((out / "summary.json").read_text())["imu"]
+    assert (told["n_carried"], told["n_restarts"]) == (len(BLIND), 0)
 
 
 @pytest.mark.acceptance

@@ -22,75 +22,15 @@ from gvo.io.bag.reader import BagMessage, BagReader, serialize, typestore
 from gvo.io.bag.topics import IMAGE_TYPE, IMAGE_TYPES
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import ChosenImages, StampedImage
-from gvo.live.odometry import LiveOdometry, LiveRun, Stretches
+from gvo.live.odometry import LiveOdometry, Stretches
 from gvo.live.topics import NetworkReader, TopicSource, wait_for
-from gvo.live.transport import decode
 from gvo.odometry.graph import RunGraph
 from gvo.runs.outputs.bag import TOPICS
 from gvo.trajectory.formats import read_trajectory
 from gvo.types import FloatArray, Optimum, Progress
 from tests.conftest import TABLES, assert_same_files
 from tests.live.conftest import N_FRAMES
-from tests.live.network import Network, recorded
-
-NO_REPORT = gvo.RunOutputs(report=False)
-SECOND_NS = 10**9
-ODOMETRY = "/gvo/odom/odometry"
-
-
-class Play:
-    """Odometry over a bag that is played in a network.
-
-    The script sends messages in a thread of its own; at its end the images end.
-    """
-
-    def __init__(
-        self, bag: Path, script: Callable[[Play], None] | None = None, **options: Any
-    ) -> None:
-        self.messages = [each for each in recorded(bag) if each.topic.name != "/tf"]
-        self.said: list[str] = []
-        self.network = Network(is_ros1=self.messages[0].topic.is_ros1)
-        self.network.announce(BagReader(bag).topics)
-        self.reader = NetworkReader(self.network)
-        self._script = script or Play.send_all
-        self._thread = threading.Thread(target=self._play, daemon=True)
-        self._thread.start()
-        source = wait_for(lambda: TopicSource(self.reader), self.said.append, threading.Event())
-        assert source is not None
-        self.source = source
-        options = {"max_waiting": 1000, "say": self.said.append, **options}
-        self.live = LiveOdometry(source, sinks=[self.network], **options)
-
-    def _play(self) -> None:
-        try:
-            self._script(self)
-        finally:
-            self.reader.close()
-
-    def send_all(self) -> None:
-        self.send(0, len(self.messages))
-
-    def send(self, start: int, end: int) -> None:
-        for message in self.messages[start:end]:
-            self.network.send(message)
-
-    def run(self, out: Path, outputs: gvo.RunOutputs = NO_REPORT) -> list[LiveRun]:
-        runs = self.live.run(out, outputs=outputs)
-        self._thread.join(timeout=60)
-        return runs
-
-    def sent(self, topic: str) -> list[Any]:
-        return [message for _, message in self.network.sent[topic]]
-
-    def call(self, name: str, **fields: Any) -> Any:
-        """Call a service as a client does, by bytes."""
-        service, is_ros1 = self.network.services[name], self.network.is_ros1
-        service.type.register(is_ros1=is_ros1)
-        store = typestore(is_ros1=is_ros1)
-        type_ = service.type.request_type
-        request = serialize(store.types[type_](**fields), type_, is_ros1=is_ros1)
-        answer = service.call(request, is_ros1=is_ros1)
-        return decode(answer, service.type.response_type, is_ros1=is_ros1)
+from tests.live.network import NO_REPORT, ODOMETRY, SECOND_NS, Network, Play, recorded, shifted
 
 
 def pose_of(message: Any) -> FloatArray:
@@ -222,15 +162,6 @@ def test_another_run_begins_after_a_reset_and_where_the_stamps_go_back(
     assert (tmp_path / "b.mcap").exists()
     assert (tmp_path / "b-3.mcap").exists()
     np.testing.assert_array_equal(pose_of(play.sent(ODOMETRY)[N_FRAMES]), np.eye(4))
-
-
-def shifted(message: BagMessage, by_ns: int) -> BagMessage:
-    content = message.decode()
-    if hasattr(content, "header"):
-        stamp = content.header.stamp
-        stamp.sec += by_ns // SECOND_NS
-    data = serialize(content, message.topic.type, is_ros1=message.topic.is_ros1)
-    return BagMessage(message.topic, message.log_time_ns + by_ns, data)
 
 
 def test_a_run_is_saved_moved_and_changed_while_it_goes_on(drive_bag: Path, tmp_path: Path) -> None:
@@ -479,7 +410,7 @@ def test_images_that_nobody_takes_are_given_up_with_a_word(
             play.send_all()
 
     play = Play(drive_bag, script)
-    play._thread.join(timeout=60)
+    play.wait()
     assert len([*play.reader.images()]) == 300
     assert caplog.text.count("images are dropped") == 1
     n_dropped = 20 * 2 * N_FRAMES - 300

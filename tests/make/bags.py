@@ -13,7 +13,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from scipy.spatial.transform import Rotation
 
 from gvo.io.bag.reader import TF_TYPE, serialize, typestore
-from gvo.io.bag.topics import CAMERA_INFO_TYPE, IMAGE_TYPE
+from gvo.io.bag.topics import CAMERA_INFO_TYPE, IMAGE_TYPE, IMU_TYPE
 from gvo.io.poses.tf import TfBuffer
 from gvo.types import FloatArray
 
@@ -187,6 +187,31 @@ def add_transform(
         transform=transform(T),
     )
     buffer.add_message(message, is_static=is_static)
+
+
+def imu(
+    topic: str,
+    stamp_ns: int,
+    gyro: ArrayLike = (0.0, 0.0, 0.0),
+    acceleration: ArrayLike = (0.0, 0.0, 0.0),
+    *,
+    frame_id: str = "imu",
+    log_time_ns: int | None = None,
+    denied: Sequence[str] = (),
+    is_ros1: bool = True,
+) -> Message:
+    """Return a sample; vectors of names that are denied have the covariance of absent ones."""
+    fields: dict[str, Any] = {
+        "orientation": _vector("Quaternion", (0.0, 0.0, 0.0, 1.0), is_ros1=is_ros1),
+        "angular_velocity": _vector("Vector3", gyro, is_ros1=is_ros1),
+        "linear_acceleration": _vector("Vector3", acceleration, is_ros1=is_ros1),
+    }
+    for name in tuple(fields):
+        fields[f"{name}_covariance"] = np.array([-1.0 if name in denied else 0.01, *[0.0] * 8])
+    message = make(
+        IMU_TYPE, is_ros1=is_ros1, header=header(frame_id, stamp_ns, is_ros1=is_ros1), **fields
+    )
+    return topic, IMU_TYPE, stamp_ns if log_time_ns is None else log_time_ns, message
 
 
 class PoseBag:

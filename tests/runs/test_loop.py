@@ -1,6 +1,6 @@
 """The loop of a run: which frames reach the outputs, as poses of what, and how it ends."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -10,6 +10,7 @@ import pytest
 from gvo.config import Config
 from gvo.errors import OutputError, RecordingError
 from gvo.geometry import se3
+from gvo.geometry.imu import Imu, ImuSamples, ImuStream
 from gvo.io.excerpt import Excerpt
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import Sensor
@@ -203,3 +204,34 @@ def test_frames_are_counted_also_where_the_last_poses_cannot_be_written(walk: He
     with pytest.raises(OutputError, match="no space"):
         loop.run([Full()], None)
     assert loop.statistics.window.n_poses == _N_FRAMES
+
+
+def _with_imu(walk: Held, samples: Callable[[int], Iterator[ImuSamples]]) -> Held:
+    stream = ImuStream(name="imu", imu=Imu(), samples=samples)
+    return replace(walk, info=replace(walk.info, imu=stream))
+
+
+def test_an_imu_that_cannot_be_read_on_is_told_of_and_the_run_goes_on(walk: Held) -> None:
+    def samples(_: int) -> Iterator[ImuSamples]:
+        yield ImuSamples.of([walk.items[0].stamp_ns], [[0.0, 0.0, 0.0]], [[0.0, 0.0, 9.81]])
+        raise RecordingError("row 2 is none")
+
+    kept, loop = run(_with_imu(walk, samples))
+    assert len(kept.frames) == _N_FRAMES
+    assert loop.statistics.broken_off == "row 2 is none"
+    assert not loop.statistics.is_complete
+
+
+def test_samples_are_asked_for_from_before_the_first_frame_of_an_excerpt(walk: Held) -> None:
+    asked_ns: list[int] = []
+
+    def samples(start_ns: int) -> Iterator[ImuSamples]:
+        asked_ns.append(start_ns)
+        yield from ()
+
+    start_ns = walk.items[4].stamp_ns
+    start_s = 1e-9 * (start_ns - walk.items[0].stamp_ns)
+    kept, _ = run(_with_imu(walk, samples), excerpt=Excerpt(start_s=start_s))
+    assert kept.frames[0].stamp_ns == start_ns
+    (first_ns,) = asked_ns
+    assert start_ns - 3 * 10**9 < first_ns < start_ns

@@ -28,6 +28,36 @@ def test_a_run_of_which_a_tenth_is_made_up_is_not_complete(
     assert len(statistics.warnings()) == (n_coasting > 0)
 
 
+def test_the_times_for_which_an_imu_led_are_added_up_gap_by_gap() -> None:
+    statistics = RunStatistics()
+    for number, letter in enumerate("m.ccc.mccmmmc"):
+        if letter == ".":
+            statistics.add_faulty(FaultyFrame(stamp_ns=number, reason="torn"), is_loss=True)
+            continue
+        is_carried = letter == "c"
+        status = Status.COASTING if is_carried else Status.OK
+        pose = estimate_at(number * 10**8)
+        statistics.add_result(result_of(pose, status=status, is_carried=is_carried))
+    assert statistics.n_carried == 6
+    # from the last frame before
+    np.testing.assert_allclose(statistics.gaps_s, [0.4, 0.2, 0.1])
+
+
+def test_what_an_imu_led_to_is_not_made_up() -> None:
+    statistics = counted(20, 0)
+    for number in range(20, 40):
+        pose = estimate_at(number)
+        statistics.add_result(result_of(pose, status=Status.COASTING, is_carried=True))
+    assert statistics.is_complete
+    assert statistics.warnings() == []
+    assert statistics.coverage_percent == 50.0
+    for number in range(40, 45):
+        statistics.add_result(result_of(estimate_at(number), status=Status.COASTING))
+    assert not statistics.is_complete
+    (warning,) = statistics.warnings()
+    assert "5 of 45 poses continue the last velocity" in warning
+
+
 def test_a_camera_that_moves_far_in_the_frame_asked_for_is_told() -> None:
     statistics = counted(5, 0)
     statistics.mount_travel_m = 0.6  # a head that turns

@@ -1,14 +1,16 @@
-"""What makes a run this run and no other."""
+"""What makes a run this run and no other, and what is told of its IMU."""
 
 import json
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 import gvo
 from gvo.errors import RecordingError
@@ -16,9 +18,10 @@ from gvo.geometry.se3 import make_transform
 from gvo.io.excerpt import Excerpt
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import StampedImage
-from gvo.io.synthetic import SyntheticRecording
+from gvo.io.synthetic import SyntheticRecording, rendered_imu
 from gvo.runs.summary import run_identity
 from gvo.trajectory.trajectory import Trajectory
+from tests.conftest import run_of
 
 MOVED = make_transform(np.eye(3), np.array([0.1, 0.2, 0.3]))
 
@@ -84,3 +87,16 @@ def test_another_version_is_another_run(monkeypatch: pytest.MonkeyPatch) -> None
     before = identity()
     monkeypatch.setattr("gvo.runs.summary.__version__", "99.0")
     assert identity() != before
+
+
+def test_what_was_learnt_of_an_imu_is_told_as_learnt(tmp_path: Path) -> None:
+    known = rendered_imu()
+    imu = replace(known, imu=replace(known.imu, T_camera_imu=None, delay_s=None), delay_s=0.02)
+    recording = SyntheticRecording("turning", "stereo", n_frames=110, scale=0.25, imu=imu)
+    result = run_of(recording, tmp_path)
+    told = result.summary["imu"]
+    assert (told["has_started"], told["is_rotation_learnt"], told["is_delay_learnt"]) == (True,) * 3
+    assert told["delay_ms"] == pytest.approx(20.0, abs=1.0)
+    R = np.array(told["T_camera_imu"])[:3, :3]
+    assert Rotation.from_matrix(R.T @ known.T_camera_imu[:3, :3]).magnitude() < 0.03
+    assert "the IMU had nothing to carry; its delay of 20 ms was learnt" in str(result)

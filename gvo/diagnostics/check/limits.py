@@ -165,6 +165,21 @@ RULES: Mapping[str, Rule] = {
     "images outside": Rule(
         high=0.25, unit="%", fix="transforms start late, end early, or are of another clock"
     ),
+    # Below, an IMU tells little of what happens between its samples; 200 Hz are customary.
+    "rate": Rule(low=90.0, fault_low=20.0, unit="Hz", fix="let the IMU send at 200 Hz"),
+    # What was measured in a longer gap is lost, and the IMU begins anew.
+    "imu gaps": Rule(high=0.1, unit="s", fix="samples were lost: record with a larger queue"),
+    "images without imu": Rule(
+        high=0.05,
+        fault_high=0.9,
+        unit="%",
+        fix="the IMU begins late, ends early, or has a clock of its own",
+    ),
+    "gravity": Rule(fault_low=8.5, fault_high=11.5, low=9.4, high=10.3, unit="m/s^2"),
+    "saturation": Rule(
+        high=0.0, unit="%", fix="choose a wider range of the IMU, or mount it softly"
+    ),
+    "turns": Rule(fault_low=0.8, fault_high=1.25, low=0.95, high=1.05),
     # As long as the gaps of images.
     "transform gaps": Rule(high=0.5, unit="s", fix="transforms were lost: poses are interpolated"),
 }

@@ -6,14 +6,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from gvo.backend.imu_alignment import Turns
 from gvo.config import Config
 from gvo.diagnostics.check.depth import check_depth
 from gvo.diagnostics.check.findings import CheckResult, Finding
 from gvo.diagnostics.check.frame_tree import check_frame_tree
 from gvo.diagnostics.check.images import check_images, check_usable
+from gvo.diagnostics.check.imu import check_imu
 from gvo.diagnostics.check.limits import judged, measured
 from gvo.diagnostics.check.sampling import Survey, survey
-from gvo.diagnostics.check.shutter import check_shutter
+from gvo.diagnostics.check.shutter import check_shutter, look_closely
 from gvo.diagnostics.check.stereo import check_stereo
 from gvo.diagnostics.check.timing import check_timing
 from gvo.errors import CalibrationError
@@ -38,8 +40,8 @@ def check_recording(
 ) -> CheckResult:
     """Check a recording for what makes odometry fail or err.
 
-    All stamps are read, and a few frames are decoded as for odometry. Memory holds these frames
-    and two numbers per image.
+    All stamps are read, and a few frames are decoded as for odometry. Memory holds these frames,
+    two numbers per image, and the samples of an IMU.
 
     Parameters
     ----------
@@ -50,7 +52,8 @@ def check_recording(
     n_samples : int
         Number of decoded frames, each with the next one.
     learn_readout : bool
-        Run odometry over parts of the recording, to tell a rolling shutter.
+        Run odometry over parts of the recording, to tell a rolling shutter, and whether an IMU
+        turns as the camera does.
     transforms : TfBuffer, optional
         Transforms of the same bag; if None, the tree of frames is not checked.
     base_frame : str
@@ -83,8 +86,12 @@ def check_recording(
         findings += check_depth(found.samples, config)
     elif not isinstance(camera, Failure):
         findings += check_stereo(found.samples, camera, config)
+    looked = None
     if learn_readout and not isinstance(camera, Failure):
-        findings += check_shutter(source, found, config)
+        looked = look_closely(source, found, config)
+        findings += check_shutter(looked, config)
+    if info.imu is not None:
+        findings += check_imu(info.imu, stamps_ns, Turns.of(looked.steps if looked else ()))
     changes = describe_camera_changes(source)
     if changes is not None:
         findings.append(

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from itertools import takewhile
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from gvo.geometry.rig import DELAY, READOUT
 from gvo.io.frames import frames
 from gvo.io.recording import ChosenImages, Source, StampedImage
 from gvo.odometry.odometry import Odometry
-from gvo.types import FaultyFrame, Frame
+from gvo.types import Edge, FaultyFrame, Frame, FrameResult
 
 # The parts that are looked at, and frames in each.
 _N_PARTS = 3
@@ -35,14 +36,30 @@ _MIN_DIFFERENCE_MS = 2.0
 _LINK_GAIN = 0.5
 
 
-def check_shutter(source: Source, found: Survey, config: Config) -> Iterator[Finding]:
-    """Yield the readout time of the camera and the delay of right images, those that are told.
+class Looked(NamedTuple):
+    """What odometry over parts of a recording tells.
 
-    Odometry runs over three parts of 30 frames, around the samples that move most.
+    Parameters
+    ----------
+    constants : list of mapping
+        What was learnt of the camera in each part, with sigmas.
+    steps : list of (int, Edge)
+        From frame to frame, with the stamps that they lead to.
     """
+
+    constants: list[Mapping[str, tuple[float, float]]]
+    steps: list[tuple[int, Edge]]
+
+
+def look_closely(source: Source, found: Survey, config: Config) -> Looked:
+    """Run odometry over three parts of 30 frames, around the samples that move most."""
     parts = _choose_parts(found, config)
-    learnt = [] if not parts else _learn(source, parts, config)
-    delay, readout = _mean_ms(learnt, DELAY), _mean_ms(learnt, READOUT)
+    return _learn(source, parts, config) if parts else Looked([], [])
+
+
+def check_shutter(looked: Looked, config: Config) -> Iterator[Finding]:
+    """Yield the readout time of the camera and the delay of right images, those that are told."""
+    delay, readout = _mean_ms(looked.constants, DELAY), _mean_ms(looked.constants, READOUT)
     if delay is not None:
         limit_ms = max(_N_SIGMAS * delay[1], _MIN_DIFFERENCE_MS)
         is_late = abs(delay[0]) > limit_ms
@@ -113,22 +130,32 @@ def _flow_px(sample: Sample, config: Config) -> float:
     return float(np.median(lengths)) if len(lengths) >= config.ransac.min_inliers else 0.0
 
 
-def _learn(
-    source: Source, parts: Sequence[tuple[int, int]], config: Config
-) -> list[Mapping[str, tuple[float, float]]]:
-    """Return the constants of the camera that odometry learns in each part, and their sigmas."""
+def _learn(source: Source, parts: Sequence[tuple[int, int]], config: Config) -> Looked:
     unknown = config.camera.model_copy(update={"readout_ms": None})
     config = config.model_copy(update={"camera": unknown})
     runs = [Odometry(source.info.camera, config) for _ in parts]
+    steps: list[tuple[int, Edge]] = []
+    last_ns: dict[int, int] = {}
     for run in runs:
         run.link_gain = _LINK_GAIN
     chosen = ChosenImages(info=source.info, images=partial(_images_of, source, parts))
     for frame in _usable(chosen, config):
         part = _part_of(frame.stamp_ns, parts)
         if part is not None:
-            runs[part].track(frame)
+            step = _step(runs[part].track(frame), last_ns.get(part))
+            last_ns[part] = frame.stamp_ns
+            steps += [] if step is None else [(frame.stamp_ns, step)]
     offsets = [run.rig_offsets for run in runs]
-    return [each.learnt.constants for each in offsets if each is not None and each.learnt]
+    constants = [each.learnt.constants for each in offsets if each is not None and each.learnt]
+    return Looked(constants, steps)
+
+
+def _step(result: FrameResult, last_ns: int | None) -> Edge | None:
+    """Return how a frame that was registered moved since the one before."""
+    T, found = result.T_previous_frame, result.registration
+    if T is None or found is None or last_ns is None:
+        return None
+    return Edge(reference_id=last_ns, T_reference_frame=T, covariance=found.covariance)
 
 
 def _part_of(stamp_ns: int, parts: Sequence[tuple[int, int]]) -> int | None:

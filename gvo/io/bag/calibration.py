@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -31,6 +31,7 @@ from gvo.io.calibration.camera_info import (
     stereo_baseline,
 )
 from gvo.io.calibration.files import CalibrationPaths, read_cameras
+from gvo.io.calibration.forms import ImuFacts
 from gvo.io.poses.tf import TfBuffer, read_tf
 from gvo.io.recording import DepthView
 from gvo.types import Failure, FloatArray
@@ -38,7 +39,7 @@ from gvo.types import Failure, FloatArray
 TRANSFORM_TYPE = "geometry_msgs/msg/Transform"
 
 # The topics of one stream of a bag that librealsense wrote.
-_REALSENSE_STREAM = re.compile(r"(/device_\d+/sensor_\d+/[^/]+)/image/data")
+_REALSENSE_STREAM = re.compile(r"(/device_\d+/sensor_\d+/[^/]+)/(?:image|imu)/data")
 # Of the focal length and of the image size: calibrations of one camera differ by less, numbers that
 # a driver copied or scaled by much less.
 _TOLERANCE, _SAME = 0.02, 0.005
@@ -57,6 +58,7 @@ class BagCalibration:
     frame_id: str = ""
     T_body_cam: FloatArray | None = None
     info_names: tuple[str, ...] = ()
+    imu: ImuFacts = field(default_factory=dict)
 
 
 def calibrations_of_messages(
@@ -117,6 +119,7 @@ def calibrations_of_file(
         depth_scale=found.depth_scale,
         frame_id=image_frame(reader, topics.first),
         T_body_cam=found.T_body_cam,
+        imu=found.imu,
     )
 
 
@@ -232,16 +235,16 @@ def _find_extrinsics(
     """
     frames = (target.fields.frame_id, source.fields.frame_id)
     if not all(frames):
-        return _of_realsense(reader, target, source)
+        return of_realsense(reader, target.image.name, source.image.name)
     if frames[0] == frames[1]:
         return Failure(reason=f"both CameraInfo name the frame {frames[0]}")
-    found = _lookup(read_tf(reader, frames=frames), frames, target.stamp_ns)
+    found = lookup_mount(read_tf(reader, frames=frames), frames, target.stamp_ns)
     if isinstance(found, Failure):
         return found
     return found, f"tf {frames[0]} -> {frames[1]}"
 
 
-def _lookup(buffer: TfBuffer, frames: tuple[str, str], stamp_ns: int) -> FloatArray | Failure:
+def lookup_mount(buffer: TfBuffer, frames: tuple[str, str], stamp_ns: int) -> FloatArray | Failure:
     """Look a mount up at a stamp, or where it is known: `CameraInfo` may come before tf."""
     found = buffer.lookup(*frames, stamp_ns)
     if not isinstance(found, Failure):
@@ -250,10 +253,11 @@ def _lookup(buffer: TfBuffer, frames: tuple[str, str], stamp_ns: int) -> FloatAr
     return np.asarray(T[np.argmin(np.abs(stamps_ns - stamp_ns))]) if len(stamps_ns) else found
 
 
-def _of_realsense(
-    reader: MessageReader, target: BagCamera, source: BagCamera
+def of_realsense(
+    reader: MessageReader, target: str, source: str
 ) -> tuple[FloatArray, str] | Failure:
-    streams = [_REALSENSE_STREAM.fullmatch(camera.image.name) for camera in (target, source)]
+    """Find T_target_source of two topics of a bag that librealsense wrote, and where."""
+    streams = [_REALSENSE_STREAM.fullmatch(name) for name in (target, source)]
     references = [set() if stream is None else _references(reader, stream[1]) for stream in streams]
     common = sorted(references[0] & references[1])
     if not common:

@@ -79,8 +79,8 @@ class MessageReader(Protocol):
     def damage(self) -> str:
         """What cannot be read, in one line."""
 
-    def messages(self, names: Collection[str]) -> Iterator[BagMessage]:
-        """Yield the messages of some topics in the order of recording."""
+    def messages(self, names: Collection[str], *, start_ns: int = 0) -> Iterator[BagMessage]:
+        """Yield the messages of some topics in the order of recording, from a time of it on."""
 
 
 class BagReader:
@@ -133,17 +133,23 @@ class BagReader:
         return self._files if self._are_loose and len(self._files) > 1 else []
 
     def messages(
-        self, names: Collection[str], *, files: Sequence[BagFile] | None = None
+        self,
+        names: Collection[str],
+        *,
+        files: Sequence[BagFile] | None = None,
+        start_ns: int = 0,
     ) -> Iterator[BagMessage]:
         """Yield the messages of some topics in the order of recording, over all files or some.
 
-        What is damaged is left out, see `damage`; in a file without an index the order is that
-        of its chunks. A file is opened when its first message is due.
+        Those recorded before `start_ns` are left out. What is damaged is left out, see `damage`;
+        in a file without an index the order is that of its chunks. A file is opened when its
+        first message is due.
         """
         streams = [
-            _begin(file, names)
+            _begin(file, names, start_ns)
             for file in files or self._files
             if any(channel.name in names for channel in file.counts)
+            and file.end_time_ns >= start_ns
         ]
         for _, message in merge(*streams, key=lambda item: item[0]):
             if message is not None:
@@ -209,10 +215,12 @@ class BagReader:
         return file
 
 
-def _begin(file: BagFile, names: Collection[str]) -> Iterator[tuple[int, FoundMessage | None]]:
+def _begin(
+    file: BagFile, names: Collection[str], start_ns: int
+) -> Iterator[tuple[int, FoundMessage | None]]:
     # The first item keeps the file closed until its time has come.
     yield file.start_time_ns, None
-    for message in file.messages(names):
+    for message in file.messages(names, start_ns):
         yield message.log_time_ns, message
 
 

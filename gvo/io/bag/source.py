@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +14,16 @@ from numpy.typing import NDArray
 
 from gvo.config import Config
 from gvo.errors import RecordingError
-from gvo.io.bag.calibration import BagCalibration, calibrations_of_file, calibrations_of_messages
+from gvo.geometry.imu import ImuStream
+from gvo.io.bag.calibration import (
+    BagCalibration,
+    calibrations_of_file,
+    calibrations_of_messages,
+    lookup_mount,
+    of_realsense,
+)
 from gvo.io.bag.cameras import CameraInfoWatch, find_contradiction
+from gvo.io.bag.imu import BagImu, StampOf, find_imu, read_samples
 from gvo.io.bag.messages import (
     decode_compressed,
     decode_compressed_depth,
@@ -25,7 +35,8 @@ from gvo.io.bag.messages import (
 from gvo.io.bag.reader import BagMessage, BagReader, MessageReader
 from gvo.io.bag.recovery.scan import Channel
 from gvo.io.bag.topics import COMPRESSED_TYPE, CameraTopics, TopicChoice, choose_topics
-from gvo.io.calibration.files import CalibrationPaths, paths_of
+from gvo.io.calibration.files import CalibrationPaths, make_imu, paths_of, with_imu
+from gvo.io.calibration.forms import ImuFacts
 from gvo.io.images import MILLIMETRES
 from gvo.io.poses.tf import TfBuffer, read_tf
 from gvo.io.poses.truth import (
@@ -77,6 +88,8 @@ class BagSource:
     config : Config, optional
         Of which `depth.scale` (otherwise that of the calibration, or 1000), `images` and
         `sync.stamps` matter.
+    imu : ImuFacts, optional
+        What is known of the IMU beside what the bag holds; None: it is left out.
 
     Raises
     ------
@@ -93,6 +106,7 @@ class BagSource:
         topics: TopicChoice | None = None,
         calibration: CalibrationPaths = None,
         config: Config | None = None,
+        imu: ImuFacts | None = None,
     ) -> None:
         paths = [paths] if isinstance(paths, Path) else list(paths)
         reader = BagReader(paths)
@@ -102,7 +116,9 @@ class BagSource:
         where = str(paths[0]) if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
         path = paths[0].resolve()
         self._name = path.stem if path.is_file() else path.name
-        self._open(reader, where, topics, calibration, config)
+        found = self._open(reader, where, topics, calibration, config)
+        if imu is not None:
+            self._add_imu(topics, found, {**imu, **found.imu})
 
     def _open(
         self,
@@ -111,7 +127,7 @@ class BagSource:
         topics: TopicChoice | None,
         calibration: CalibrationPaths,
         config: Config | None,
-    ) -> None:
+    ) -> BagCalibration:
         config = config or Config()
         self._reader, self._where = reader, where
         self._tf: TfBuffer | None = None
@@ -131,6 +147,40 @@ class BagSource:
         self._scale = config.depth.scale or found.depth_scale or MILLIMETRES
         self._images_config = config.images
         self.info = self._describe(found)
+        return found
+
+    def _add_imu(
+        self, topics: TopicChoice | None, found: BagCalibration, facts: ImuFacts
+    ) -> BagImu | None:
+        """Add the IMU to what is known, placed by the calibration, else by tf; return it."""
+        camera, asked = (self._topics.first, found.frame_id), topics.imu if topics else None
+        hint = facts.get("topic", "")
+        chosen = find_imu(self._reader, camera, asked, hint, self._where, stamp_of=self._stamp_of)
+        if isinstance(chosen, Failure):
+            self.info.decisions.extend(f"imu: none: {each}" for each in [chosen.reason] if each)
+            return None
+        imu, origin = make_imu(facts, found.T_body_cam), "the calibration"
+        if imu.T_camera_imu is None:
+            mount = self._mount(chosen)
+            if not isinstance(mount, Failure):
+                imu, origin = replace(imu, T_camera_imu=mount[0]), mount[1]
+        samples = partial(read_samples, self._reader, chosen, self._stamp_of)
+        stream = ImuStream(name=chosen.gyro.name, imu=imu, samples=samples)
+        self.info = with_imu(self.info, stream, chosen.describe(), origin)
+        return chosen
+
+    @property
+    def _stamp_of(self) -> StampOf:
+        return attrgetter("log_time_ns") if self._takes_log_time else header_stamp
+
+    def _mount(self, imu: BagImu) -> tuple[FloatArray, str] | Failure:
+        """Return T_camera_imu by what the bag holds, and where it was found."""
+        found = of_realsense(self._reader, self.image_topics[0], imu.gyro.name)
+        frames = self.info.frame_id, imu.frame_id
+        if not isinstance(found, Failure) or not all(frames):
+            return found
+        T = lookup_mount(self.transforms(frames), frames, 0)
+        return T if isinstance(T, Failure) else (T, f"tf {frames[0]} -> {frames[1]}")
 
     @property
     def image_topics(self) -> tuple[str, str]:

@@ -14,6 +14,9 @@ IMAGE_TYPE = "sensor_msgs/msg/Image"
 COMPRESSED_TYPE = "sensor_msgs/msg/CompressedImage"
 IMAGE_TYPES = (IMAGE_TYPE, COMPRESSED_TYPE)
 CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
+IMU_TYPE = "sensor_msgs/msg/Imu"
+NO_IMU = "none"
+"""Chosen in place of the topic of an IMU: none is used."""
 
 _COMPRESSED_SUFFIXES = ("/compressed", "/compressedDepth")
 _NUMBERED = ("image_", "image_0", "image", "cam", "cam_", "camera", "camera_")
@@ -85,6 +88,7 @@ class TopicChoice:
     color: str | None = None
     depth: str | None = None
     camera_info: tuple[str, ...] = ()
+    imu: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -169,7 +173,7 @@ def camera_info_topics(image: Topic, infos: Iterable[Topic]) -> list[tuple[_Scor
         numbers = [any(map(str.isdigit, each)) for each in (said - words, words - said)]
         if is_near or not ((said - words) & against or all(numbers)):
             rank = places.index(place) if is_near else len(places)
-            n_common, n_said = _n_common_parts(image, topic), len(said & words)
+            n_common, n_said = n_common_parts(image, topic), len(said & words)
             found.append(((not is_near, rank, -n_common, -n_said), topic))
     return sorted(found, key=lambda each: each[0])
 
@@ -240,7 +244,7 @@ def _rgbd_pairs(images: Sequence[Topic], *, is_found: bool = True) -> Iterator[C
         # the depth of a stereo camera is that of its left one
         is_right = any(name in usable for name in _other_side(color.name.lower(), "right", "left"))
         for depth in depths:
-            is_beside = is_found or _n_common_parts(color, depth) > 0
+            is_beside = is_found or n_common_parts(color, depth) > 0
             if is_beside and (not is_right or "right" in depth.name.lower()):
                 yield CameraTopics(sensor="rgbd", first=color, second=depth)
 
@@ -277,11 +281,12 @@ def _score(pair: CameraTopics) -> _Score:
         return score
     says_state = pair.second.is_rectified or _RAW_DEPTH.search(pair.second.base.lower())
     is_consistent = not says_state or pair.first.is_rectified == pair.second.is_rectified
-    n_common = _n_common_parts(pair.first, pair.second)
+    n_common = n_common_parts(pair.first, pair.second)
     return n_common, pair.second.is_registered, is_consistent, *score
 
 
-def _n_common_parts(first: Topic, second: Topic) -> int:
+def n_common_parts(first: Topic, second: Topic) -> int:
+    """Return the number of parts with which the names of both begin."""
     parts = zip(first.base.split("/"), second.base.split("/"), strict=False)
     return next((n for n, (a, b) in enumerate(parts) if a != b), 0)
 

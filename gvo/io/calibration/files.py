@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -13,14 +13,21 @@ from gvo._text import access_fault
 from gvo.errors import CalibrationError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
+from gvo.geometry.imu import Imu, ImuStream
 from gvo.io.calibration.camera_info import (
     make_calibration,
     make_rgbd_calibration,
     pair_of_extrinsics,
     stereo_baseline,
 )
-from gvo.io.calibration.forms import DescribedCamera, read_calibration_file
-from gvo.io.recording import Sensor
+from gvo.io.calibration.forms import (
+    IMU_DENSITIES,
+    DescribedCamera,
+    ImuFacts,
+    read_calibration_file,
+    read_imu_file,
+)
+from gvo.io.recording import RecordingInfo, Sensor
 from gvo.types import FloatArray
 
 CalibrationPaths: TypeAlias = Sequence[Path] | Path | None
@@ -28,6 +35,9 @@ CalibrationPaths: TypeAlias = Sequence[Path] | Path | None
 ImageSize: TypeAlias = Callable[[], tuple[int, int]]
 """Returns width and height of the images that are to be read, pixels."""
 _SENSOR_FILES = tuple(Path(name) / "sensor.yaml" for name in ("cam0", "cam1"))
+# Of a file that was given, or in a folder.
+_IMU_FILES = ("", "imu0/sensor.yaml", "mav0/imu0/sensor.yaml")
+_OF_IMU = (*IMU_DENSITIES, "delay_s")
 _SIDE_FILES = (Path("left.yaml"), Path("right.yaml"))
 
 
@@ -47,6 +57,8 @@ class CameraSet:
         Maps the rectified left or colour camera to the body of the files, metres.
     depth_scale : float, optional
         Counts per metre of integer depth.
+    imu : ImuFacts
+        What the first camera says of the IMU beside it.
     """
 
     calibrations: tuple[Calibration, ...]
@@ -54,6 +66,7 @@ class CameraSet:
     baseline_from: str = ""
     T_body_cam: FloatArray | None = None
     depth_scale: float | None = None
+    imu: ImuFacts = field(default_factory=dict)
 
     @property
     def pair(self) -> tuple[Calibration, Calibration]:
@@ -111,6 +124,33 @@ def paths_of(calibration: CalibrationPaths, *own: Path) -> tuple[Path, ...]:
     return given or own
 
 
+def split_imu(calibration: CalibrationPaths) -> tuple[tuple[Path, ...], ImuFacts]:
+    """Return the paths of cameras, and what those of an IMU say."""
+    given, facts = paths_of(calibration), ImuFacts()
+    files = [path / name for path in given for name in _IMU_FILES if (path / name).is_file()]
+    said = {file: found for file in files if (found := read_imu_file(file))}
+    for found in said.values():
+        facts |= found
+    return tuple(path for path in given if path not in said), facts
+
+
+def make_imu(facts: ImuFacts, T_body_cam: FloatArray | None) -> Imu:
+    """Return an IMU of what is said of it, and of where the rectified camera is on the body."""
+    values = {key: value for key, value in facts.items() if key in _OF_IMU}
+    if T_body_cam is not None and "T_body_imu" in facts:
+        values["T_camera_imu"] = se3.normalize(se3.invert(T_body_cam) @ facts["T_body_imu"])
+    return Imu(**values)
+
+
+def with_imu(info: RecordingInfo, stream: ImuStream, what: str, origin: str) -> RecordingInfo:
+    """Return what is known of a recording with its IMU; `origin` says what its place comes from."""
+    imu = stream.imu
+    place = "its place is learnt" if imu.T_camera_imu is None else f"placed by {origin}"
+    delay = "learnt" if imu.delay_s is None else f"{1e3 * imu.delay_s:.4g} ms"
+    line = f"imu: {what}; {place}, its delay is {delay}"
+    return replace(info, imu=stream, decisions=[*info.decisions, line])
+
+
 def pose_of_rectified(T_body_raw: FloatArray, camera: Calibration) -> FloatArray:
     """Return T_body_cam of the rectified camera of that of the raw one."""
     return T_body_raw @ se3.make_transform(camera.R.T, np.zeros(3))
@@ -158,7 +198,11 @@ def _stereo_set(cameras: list[DescribedCamera], origin: str, *, is_rectified: bo
         pair = pair_of_extrinsics(pair, T_left_right, origin)
     stereo_baseline(pair, origin)
     return CameraSet(
-        calibrations=pair, origin=origin, baseline_from=key, T_body_cam=_on_body(left, pair[0])
+        calibrations=pair,
+        origin=origin,
+        baseline_from=key,
+        T_body_cam=_on_body(left, pair[0]),
+        imu=left.imu,
     )
 
 
@@ -194,6 +238,7 @@ def _rgbd_set(cameras: list[DescribedCamera], origin: str, *, is_rectified: bool
         origin=origin,
         T_body_cam=_on_body(cameras[0], calibration),
         depth_scale=cameras[0].depth_scale,
+        imu=cameras[0].imu,
     )
 
 

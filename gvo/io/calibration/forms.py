@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -27,6 +27,8 @@ from gvo.io.calibration.camera_info import (
 from gvo.types import FloatArray
 
 Content: TypeAlias = Mapping[Any, Any]
+ImuFacts: TypeAlias = dict[str, Any]
+"""What is said of an IMU: values of `Imu` by name, `T_body_imu` (4, 4), and its `topic`."""
 
 _OPENCV_MATRIX = "tag:yaml.org,2002:opencv-matrix"
 # OpenCV also reads `data:[0]` and `PointSize:2`, as the files of ORB-SLAM have them.
@@ -55,6 +57,16 @@ _OF_KANNALA_BRANDT = dict(
 )
 # By their keys whether they map the other way round.
 _TO_BODY = {"T_BS": False, "T_cam_imu": True, "T_imu_cam": False}
+# Kalibr's, of a camera whose body is the IMU: t_imu = t_cam + timeshift.
+_TO_IMU = ("T_cam_imu", "T_imu_cam")
+TIMESHIFT = "timeshift_cam_imu"
+# Kalibr's and EuRoC's densities of an IMU, by what `Imu` calls them.
+IMU_DENSITIES = {
+    "gyro_noise": "gyroscope_noise_density",
+    "gyro_walk": "gyroscope_random_walk",
+    "acceleration_noise": "accelerometer_noise_density",
+    "acceleration_walk": "accelerometer_random_walk",
+}
 _FROM_PREVIOUS = {"T_cn_cnm1": False, "T_c1_c2": True, "Tlr": True}
 _COMMON = ("type", "width", "height")
 _DEPTH_KEYS = ("depth_scale", "DepthMapFactor", "depthmap_factor")
@@ -77,6 +89,8 @@ class DescribedCamera:
         Of a rectified pair whose cameras are both like this one, pixels times metres.
     depth_scale : float, optional
         Counts per metre of integer depth.
+    imu : ImuFacts
+        What is said of the IMU beside it.
     """
 
     fields: CameraFields
@@ -84,6 +98,7 @@ class DescribedCamera:
     T_cam_previous: FloatArray | None = None
     focal_x_baseline: float | None = None
     depth_scale: float | None = None
+    imu: ImuFacts = field(default_factory=dict)
 
 
 def read_calibration_file(path: Path) -> tuple[DescribedCamera, ...]:
@@ -99,6 +114,39 @@ def read_calibration_file(path: Path) -> tuple[DescribedCamera, ...]:
     content = _load(text, path)
     scale = _depth_scale(content, path)
     return tuple(replace(each, depth_scale=scale) for each in _cameras(content, path, FORMS))
+
+
+def read_imu_file(path: Path) -> ImuFacts:
+    """Read what the file of an IMU says: Kalibr's imu.yaml, EuRoC's sensor.yaml of `imu0`.
+
+    Empty where it is a file of cameras.
+    """
+    text = _read(path)
+    if _KITTI_ROW.search(text):
+        return {}
+    content = _load(text, path)
+    own = _part(content, "imu0") or content
+    if not any(key in own for key in IMU_DENSITIES.values()):
+        return {}
+    facts = _imu_beside(own, str(path))
+    for name, key in IMU_DENSITIES.items():
+        if key in own:
+            facts[name] = float(_array(own, key, (1,), str(path))[0])
+            if facts[name] <= 0.0:
+                raise CalibrationError(f"{path}: {key} must be positive, got {facts[name]:g}")
+    if "T_BS" in own:
+        facts["T_body_imu"] = _transform(own, {"T_BS": False}, str(path))
+    return facts | ({"topic": str(own["rostopic"])} if "rostopic" in own else {})
+
+
+def _imu_beside(content: Content, where: str) -> ImuFacts:
+    """Return what a camera or an IMU says of how both belong together."""
+    facts: ImuFacts = {"T_body_imu": np.eye(4)} if any(map(content.get, _TO_IMU)) else {}
+    if content.get(TIMESHIFT) is not None:
+        facts["delay_s"] = 0.0 - float(_array(content, TIMESHIFT, (1,), where)[0])
+    elif TIMESHIFT in content:
+        facts["delay_s"] = None  # it is said not to be known
+    return facts
 
 
 def _cameras(content: Content, path: Path, forms: Iterable[Form]) -> tuple[DescribedCamera, ...]:
@@ -204,6 +252,7 @@ def _described(content: Content, where: str) -> DescribedCamera:
         T_body_cam=_transform(content, _TO_BODY, where),
         T_cam_previous=_transform(content, _FROM_PREVIOUS, where),
         focal_x_baseline=_focal_x_baseline(content, fields, where),
+        imu=_imu_beside(content, where),
     )
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
+from heapq import merge
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -13,11 +15,14 @@ from numpy.typing import NDArray
 from gvo.errors import RecordingError
 from gvo.geometry.camera import Calibration
 from gvo.io.convert import bag_messages
-from gvo.io.convert.bag_messages import BagWriter, FramePose, Header
+from gvo.io.convert.bag_messages import BagWriter, FramePose, Header, ImuSample
 from gvo.io.convert.plan import BODY_FRAME, Form, plan_images, pose_of_right, pose_on_body
 from gvo.io.images import MILLIMETRES, exact_counts
 from gvo.io.poses.truth import TRUTH_FRAMES
 from gvo.io.recording import RecordingInfo, Source, StampedImage
+
+IMU_FRAME = "imu"
+"""Name in tf of the axes in which an IMU measures."""
 
 BagStreams: TypeAlias = tuple["BagStream", "BagStream"]
 
@@ -54,7 +59,8 @@ class BagForm(Form):
     `CameraInfo` of its stamp beside it. The ground truth is written to `/tf`: `world` to
     `ground_truth`, the pose of the rectified camera. `/tf_static` holds the right camera in the
     left one, and both in `body` where the recording says where they sit there; the frames are
-    those of the rectified cameras, also beside raw images.
+    those of the rectified cameras, also beside raw images. An IMU becomes `/imu`, and its place
+    the frame `imu`.
     """
 
     def __init__(self, path: Path, source: Source, **options: Any) -> None:  # noqa: ANN401
@@ -63,10 +69,9 @@ class BagForm(Form):
         self.names = tuple(f"{stream.topic} images" for stream in self._streams)
         is_depth_compressed = self.info.sensor == "stereo" or _is_in_millimetres(self.source)
         self._is_compressed = (self.compress, self.compress and is_depth_compressed)
-        self._poses: list[FramePose] = []
-        if self.truth is not None:
-            rows = zip(self.truth.stamps_ns.tolist(), self.truth.T_world_frame, strict=True)
-            self._poses = [FramePose(stamp_ns, *TRUTH_FRAMES, T) for stamp_ns, T in rows]
+        # What has stamps of its own: true poses and samples of the IMU.
+        self._beside = merge(self._poses(), self._samples(), key=attrgetter("stamp_ns"))
+        self._next = next(self._beside, None)
         self._is_empty = True
         self._bag = BagWriter(path, keeps_order=True)
         self.path = self._bag.result
@@ -84,11 +89,11 @@ class BagForm(Form):
         return self.recorded()
 
     def write(self, image: StampedImage, pixels: NDArray[Any]) -> None:
-        """Write the true poses up to an image, and the image beside its calibration."""
+        """Write what comes before an image, and the image beside its calibration."""
         if self._is_empty:
             self._write_static(image.stamp_ns)
             self._is_empty = False
-        self._write_poses(image.stamp_ns)
+        self._write_beside(image.stamp_ns)
         stream, is_compressed = self._streams[image.stream], self._is_compressed[image.stream]
         header = Header(image.stamp_ns, stream.frame_id)
         bag_messages.write_camera_info(self._bag, stream.info_topic, stream.calibration, header)
@@ -103,19 +108,32 @@ class BagForm(Form):
 
     def _write_static(self, stamp_ns: int) -> None:
         # Whoever plays the bag knows the cameras before the first image or pose comes.
-        stamp_ns = min([stamp_ns, *(pose.stamp_ns for pose in self._poses[:1])])
+        stamp_ns = stamp_ns if self._next is None else min(stamp_ns, self._next.stamp_ns)
         first, second = self._streams
         poses = static_poses(self.source, (first.frame_id, second.frame_id), stamp_ns)
         bag_messages.write_transforms(self._bag, "/tf_static", poses, is_latched=True)
 
-    def _write_poses(self, until_ns: float = np.inf) -> None:
-        while self.n_poses < len(self._poses) and self._poses[self.n_poses].stamp_ns <= until_ns:
-            bag_messages.write_transforms(self._bag, "/tf", [self._poses[self.n_poses]])
-            self.n_poses += 1
+    def _poses(self) -> Iterator[FramePose | ImuSample]:
+        if self.truth is not None:
+            rows = zip(self.truth.stamps_ns.tolist(), self.truth.T_world_frame, strict=True)
+            yield from (FramePose(stamp_ns, *TRUTH_FRAMES, T) for stamp_ns, T in rows)
+
+    def _samples(self) -> Iterator[FramePose | ImuSample]:
+        for part in self.imu_samples():
+            yield from map(ImuSample, part.stamps_ns.tolist(), part.gyro, part.acceleration)
+
+    def _write_beside(self, until_ns: float = np.inf) -> None:
+        while self._next is not None and self._next.stamp_ns <= until_ns:
+            if isinstance(self._next, FramePose):
+                bag_messages.write_transforms(self._bag, "/tf", [self._next])
+                self.n_poses += 1
+            else:
+                bag_messages.write_imu(self._bag, "/imu", self._next, IMU_FRAME)
+            self._next = next(self._beside, None)
 
     def finish(self) -> None:
-        """Write the true poses after the last image."""
-        self._write_poses()
+        """Write what comes after the last image."""
+        self._write_beside()
 
 
 def plan_streams(source: Source, *, rectify: bool) -> BagStreams:
@@ -160,7 +178,7 @@ def _is_in_millimetres(source: Source) -> bool:
 
 
 def static_poses(source: Source, frame_ids: tuple[str, str], stamp_ns: int) -> Iterator[FramePose]:
-    """Yield T_body_cam where the recording knows it, and T_left_right of a stereo pair.
+    """Yield T_body_cam and T_camera_imu where the recording knows them, and T_left_right of a pair.
 
     Parameters
     ----------
@@ -177,3 +195,6 @@ def static_poses(source: Source, frame_ids: tuple[str, str], stamp_ns: int) -> I
         yield FramePose(stamp_ns, BODY_FRAME, first, T_body_cam)
     if source.info.sensor == "stereo":
         yield FramePose(stamp_ns, first, second, pose_of_right(source.info))
+    imu = source.info.imu
+    if imu is not None and imu.imu.T_camera_imu is not None:
+        yield FramePose(stamp_ns, first, IMU_FRAME, imu.imu.T_camera_imu)

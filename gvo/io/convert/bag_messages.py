@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from gvo.errors import RecordingError
 from gvo.geometry.camera import Calibration
 from gvo.io.bag.reader import TF_TYPE, serialize, typestore
-from gvo.io.bag.topics import CAMERA_INFO_TYPE, COMPRESSED_TYPE, IMAGE_TYPE
+from gvo.io.bag.topics import CAMERA_INFO_TYPE, COMPRESSED_TYPE, IMAGE_TYPE, IMU_TYPE
 from gvo.io.images import MILLIMETRES, encode_image, exact_counts
 from gvo.types import DepthArray, FloatArray, ImageArray
 
@@ -57,6 +57,14 @@ class FramePose(NamedTuple):
     parent: str
     child: str
     T_parent_child: FloatArray
+
+
+class ImuSample(NamedTuple):
+    """What an IMU measured: stamp in nanoseconds, rad/s (3,), m/s^2 (3,)."""
+
+    stamp_ns: int
+    gyro: FloatArray
+    acceleration: FloatArray
 
 
 class MessageWriter(ABC):
@@ -283,6 +291,19 @@ def write_camera_info(
         **{name if writer.is_ros1 else name.lower(): M for name, M in matrices.items()},
     )
     writer.write(topic, CAMERA_INFO_TYPE, message, header.stamp_ns)
+
+
+def write_imu(writer: MessageWriter, topic: str, sample: ImuSample, frame_id: str) -> None:
+    """Write a sample of an IMU without loss, as one that tells no orientation."""
+    vectors = {"angular_velocity": sample.gyro, "linear_acceleration": sample.acceleration}
+    fields: dict[str, Any] = {"orientation_covariance": np.array([-1.0, *[0.0] * 8])}
+    for name, vector in vectors.items():
+        numbers = dict(zip("xyz", vector.tolist(), strict=True))
+        fields[name] = writer.make("geometry_msgs/msg/Vector3", **numbers)
+        fields[f"{name}_covariance"] = np.zeros(9)
+    header = writer.header(Header(sample.stamp_ns, frame_id))
+    message = writer.make(IMU_TYPE, header=header, **fields)
+    writer.write(topic, IMU_TYPE, message, sample.stamp_ns)
 
 
 def write_transforms(

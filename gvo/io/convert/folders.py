@@ -12,7 +12,10 @@ from numpy.typing import NDArray
 
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
+from gvo.geometry.imu import Imu
+from gvo.io.calibration.forms import IMU_DENSITIES, TIMESHIFT
 from gvo.io.convert.plan import Form, pose_of_right, pose_on_body
+from gvo.io.datasets.imu_table import write_imu_table
 from gvo.io.datasets.tum import DEFAULT_SCALE
 from gvo.io.frames import paired
 from gvo.io.images import MAX_COUNT, MILLIMETRES, encode_image, is_in_counts, to_counts
@@ -32,6 +35,8 @@ class KittiForm(Form):
 
     The stamp of a pair is that of the left image; unpaired images are left out.
     """
+
+    holds_imu = False
 
     def __init__(self, path: Path, source: Source, **options: Any) -> None:  # noqa: ANN401
         super().__init__(path, source, **options)
@@ -91,7 +96,8 @@ class KittiForm(Form):
 class EurocForm(Form):
     """Pairs by stamp, raw or rectified, with the calibration of each camera.
 
-    Where the recording does not place its cameras on a body, the rectified left camera is it.
+    Where the recording does not place its cameras on a body, the rectified left camera is it. An
+    IMU becomes `imu0`.
     """
 
     def __init__(self, path: Path, source: Source, **options: Any) -> None:  # noqa: ANN401
@@ -121,6 +127,11 @@ class EurocForm(Form):
             T_rectified_written = se3.make_transform(written.R, np.zeros(3))
             T_body_written = self._T_body_cam @ T_left_rectified @ T_rectified_written
             _write_sensor_yaml(camera / "sensor.yaml", written, T_body_written)
+        if self.info.imu is not None:
+            folder = self._root / "imu0"
+            folder.mkdir()
+            write_imu_table(folder / "data.csv", self.imu_samples())
+            _write_imu_yaml(folder / "sensor.yaml", self.info.imu.imu, self._T_body_cam)
         if self.truth is not None:
             folder = self._root / "state_groundtruth_estimate0"
             folder.mkdir()
@@ -130,6 +141,8 @@ class EurocForm(Form):
 
 class TumForm(Form):
     """Colour and depth by stamp, with `calibration.yaml`."""
+
+    holds_imu = False
 
     def __init__(self, path: Path, source: Source, **options: Any) -> None:  # noqa: ANN401
         super().__init__(path, source, **options)
@@ -190,6 +203,17 @@ def _write_sensor_yaml(path: Path, calibration: Calibration, T_body_sensor: Floa
         "distortion_model": _EUROC_MODELS.get(calibration.model, calibration.model),
         "distortion_coefficients": _numbers(calibration.D),
     }
+    path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+
+
+def _write_imu_yaml(path: Path, imu: Imu, T_body_cam: FloatArray) -> None:
+    """Write the `sensor.yaml` of an IMU, and Kalibr's time shift; null where it is not known."""
+    content: dict[str, Any] = {"sensor_type": "imu"}
+    if imu.T_camera_imu is not None:
+        T_body_imu = T_body_cam @ imu.T_camera_imu
+        content["T_BS"] = {"cols": 4, "rows": 4, "data": _numbers(T_body_imu)}
+    content |= {key: float(getattr(imu, name)) for name, key in IMU_DENSITIES.items()}
+    content[TIMESHIFT] = None if imu.delay_s is None else 0.0 - imu.delay_s
     path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
 
 

@@ -16,6 +16,7 @@ from gvo.config import SyncConfig
 from gvo.errors import GvoError, RecordingError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
+from gvo.geometry.imu import ImuSamples
 from gvo.io.bag.source import BagSource
 from gvo.io.edges.events import InputFaults
 from gvo.io.frames import ImagePreparer, make_preparers
@@ -48,6 +49,8 @@ class Form(AbstractContextManager["Form"], ABC):
         What is left out and why, a line each, besides images.
     """
 
+    holds_imu = True
+
     def __init__(
         self, path: Path, source: Source, *, rectify: bool, compress: bool, sync: SyncConfig
     ) -> None:
@@ -59,6 +62,8 @@ class Form(AbstractContextManager["Form"], ABC):
         self._faults = InputFaults()
         self.calibrations, self._preparers = plan_images(self.info, rectify=rectify)
         self.truth = self._true_poses()
+        if self.info.imu is not None and not self.holds_imu:
+            self.notes.append(f"IMU: {self.info.imu.name} is left out, such a folder holds none")
 
     @property
     def skipped(self) -> tuple[str, ...]:
@@ -69,6 +74,13 @@ class Form(AbstractContextManager["Form"], ABC):
         """Yield the images up to where the recording cannot be read on; note why."""
         try:
             yield from self.source.images()
+        except RecordingError as error:
+            self.notes.append(str(error))
+
+    def imu_samples(self) -> Iterator[ImuSamples]:
+        """Yield the samples of the IMU up to where they cannot be read on; note why."""
+        try:
+            yield from () if self.info.imu is None else self.info.imu.samples(0)
         except RecordingError as error:
             self.notes.append(str(error))
 

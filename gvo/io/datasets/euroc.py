@@ -7,18 +7,22 @@ from functools import partial
 from pathlib import Path
 
 from gvo.config import Config
-from gvo.errors import CalibrationError
+from gvo.errors import CalibrationError, RecordingError
 from gvo.geometry import se3
+from gvo.geometry.imu import ImuStream
 from gvo.io.calibration.camera_info import stereo_baseline
 from gvo.io.calibration.files import (
     CalibrationPaths,
     CameraSet,
+    make_imu,
     paths_of,
     pose_of_rectified,
     read_cameras,
+    with_imu,
 )
-from gvo.io.calibration.forms import read_calibration_file
+from gvo.io.calibration.forms import ImuFacts, read_calibration_file, read_imu_file
 from gvo.io.datasets.files import FolderSource, StampedPath, image_size, read_stamped_rows
+from gvo.io.datasets.imu_table import read_imu_table
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
@@ -38,6 +42,8 @@ class EurocSource(FolderSource):
         they say where the cameras are on the body, that counts, too.
     config : Config, optional
         Of images with 16 bits; the defaults when left out.
+    imu : ImuFacts, optional
+        What counts before what `imu0` says of itself; None: the IMU is left out.
 
     Raises
     ------
@@ -46,7 +52,12 @@ class EurocSource(FolderSource):
     """
 
     def __init__(
-        self, folder: Path, *, calibration: CalibrationPaths = None, config: Config | None = None
+        self,
+        folder: Path,
+        *,
+        calibration: CalibrationPaths = None,
+        config: Config | None = None,
+        imu: ImuFacts | None = None,
     ) -> None:
         self._root = folder / "mav0" if (folder / "mav0").is_dir() else folder
         images = {name: _list_images(self._root / name) for name in ("cam0", "cam1")}
@@ -66,6 +77,22 @@ class EurocSource(FolderSource):
         cameras = replace(cameras, T_body_cam=self._T_body_cam)
         named = folder.resolve().parent if folder.name == "mav0" else folder
         super().__init__(named, cameras, images, decisions, config)
+        table = self._root / "imu0" / "data.csv"
+        if imu is not None and table.is_file():
+            self._add_imu(table, {**imu, **cameras.imu})
+
+    def _add_imu(self, table: Path, given: ImuFacts) -> None:
+        """Add the IMU to what is known; its clock is that of the cameras, if nothing else is said.
+
+        The first samples are read, so that a file of another form is refused before any work.
+        """
+        sensor = table.with_name("sensor.yaml")
+        own = read_imu_file(sensor) if sensor.is_file() else {}
+        imu = make_imu({"delay_s": 0.0, **own, **given}, self._T_body_cam)
+        if next(read_imu_table(table, 0), None) is None:
+            raise RecordingError(f"{table}: holds no rows; mend it, or give --imu none")
+        stream = ImuStream(name="imu0", imu=imu, samples=partial(read_imu_table, table))
+        self.info = with_imu(self.info, stream, "imu0", "the calibration")
 
     def ground_truth(self) -> Trajectory | None:
         """Return T_world_cam of the rectified left camera."""

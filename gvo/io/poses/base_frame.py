@@ -23,12 +23,14 @@ from gvo.io.poses.truth import moved
 from gvo.io.recording import Source
 from gvo.trajectory.g2o import transforms_of
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Edge, Estimate, Failure, FloatArray, IntArray, Loop
+from gvo.types import Edge, Estimate, Failure, FloatArray, InertialState, IntArray, Loop
 
 InitialPose: TypeAlias = FloatArray | Literal["truth"]
 Mount: TypeAlias = Callable[[int], tuple[FloatArray, bool]]
 
 _ROTATION_TOLERANCE = 1e-3
+# Over so long a time the motion of a camera on its frame is measured, nanoseconds.
+_MOTION_NS = 20_000_000
 
 
 class BaseFrame:
@@ -200,6 +202,21 @@ class BaseFrame:
             T_reference_frame=edge.T_reference_frame,
             covariance=edge.covariance,
             effects=edge.effects,
+        )
+
+    def apply_to_inertial(self, state: InertialState | None) -> InertialState | None:
+        """Return what the IMU tells of the camera as what it tells of the base frame."""
+        if self.is_camera or state is None:
+            return state
+        T_base_cam, _ = self._mount_at(state.stamp_ns)
+        ends_ns = state.stamp_ns - _MOTION_NS // 2, state.stamp_ns + _MOTION_NS // 2
+        before, after = (self._mount_at(stamp_ns)[0] for stamp_ns in ends_ns)
+        on_base = se3.log(se3.invert(before) @ after) * 1e9 / _MOTION_NS
+        return replace(
+            state,
+            twist=se3.adjoint(T_base_cam) @ (state.twist - on_base),
+            twist_covariance=se3.transport_covariance(state.twist_covariance, T_base_cam),
+            up=T_base_cam[:3, :3] @ state.up,
         )
 
     def convert(self, trajectory: Trajectory) -> Trajectory:

@@ -16,8 +16,15 @@ from numpy.typing import NDArray
 from gvo._text import exists, read_text, text_lines
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
-from gvo.io.run_folder.verdict import nees_table, reference_words
-from gvo.io.run_folder.writer import GLOBAL, POSITIONS_HEADER, TRAJECTORIES, TRUE_POSITIONS, TRUTH
+from gvo.io.run_folder.verdict import imu_words, nees_table, reference_words
+from gvo.io.run_folder.writer import (
+    GLOBAL,
+    INERTIAL_HEADER,
+    POSITIONS_HEADER,
+    TRAJECTORIES,
+    TRUE_POSITIONS,
+    TRUTH,
+)
 from gvo.trajectory.evaluation import SMOOTHED_GLOBAL
 from gvo.trajectory.formats import MAX_LINES, MAX_POSITION_M, read_trajectory
 from gvo.trajectory.trajectory import StampsFrom, Trajectory
@@ -32,6 +39,7 @@ _REQUIRED = {
     "edges": ("stamp_ns", "reference_ns", "kind", "is_accepted", "chi2"),
     "timings": ("stamp_ns",),
     "loops": ("stamp_ns", "reference_ns", "n_inliers", "residual", "reason"),
+    "inertial": INERTIAL_HEADER,
 }
 _EXPECTED = "expected a folder that gvo run or gvo smooth wrote"
 
@@ -61,6 +69,9 @@ class RunRecord:
     loops : Table
         Of `loops.csv`: `stamp_ns`, `reference_ns`, `n_inliers`, `residual` (norm of the whitened
         one) and `reason` (why it does not count, else empty). Empty without global poses.
+    inertial : Table
+        Of `inertial.csv`: `stamp_ns`, `is_carried`, and numbers by the names there. Empty without
+        an IMU, and until it has started.
     trajectories : dict of str to Trajectory
         "raw", "causal" and "smoothed", with covariances where the run computed them; may be
         empty, as "causal" where all was optimized at once. "global" where there is one.
@@ -74,6 +85,7 @@ class RunRecord:
     edges: Table
     timings: Table
     loops: Table
+    inertial: Table
     trajectories: dict[str, Trajectory]
     truth: Trajectory | None
 
@@ -157,6 +169,7 @@ def read_run(folder: str | Path) -> RunRecord:
         edges=tables["edges"],
         timings=tables["timings"],
         loops=tables["loops"],
+        inertial=tables["inertial"],
         trajectories=read_estimates(folder, is_growing=True),
         truth=_read_truth(folder, summary),
     )
@@ -187,6 +200,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
             raise RecordingError(f"{path}: holds no object; {_EXPECTED}")
         nees_table(summary.get("nees") or {})
         reference_words(summary.get("reference"))
+        imu_words(summary)
     except (OSError, ValueError, RecursionError, AttributeError, LookupError, TypeError) as error:
         raise RecordingError(f"{path}: is damaged: {error}; run again") from error
     fault = _transform_fault(summary.get("T_base_truth"))
@@ -249,11 +263,12 @@ def _dtype(name: str) -> type | None:
     """Return what a column of this name holds; None for those that nobody reads."""
     if name in ("status", "kind", "reason"):
         return np.object_
-    if name == "is_accepted":
+    if name in ("is_accepted", "is_carried"):
         return np.bool_
     if name in ("stamp_ns", "reference_ns") or name.startswith("n_"):
         return np.int64
-    return np.float64 if name in ("chi2", "residual") or name.endswith(("_ms", "_m")) else None
+    is_number = name in ("chi2", "residual", *INERTIAL_HEADER) or name.endswith(("_ms", "_m"))
+    return np.float64 if is_number else None
 
 
 _CONVERTERS: dict[type, Callable[[str], object]] = {

@@ -133,6 +133,29 @@ def loop_words(summary: Mapping[str, Any]) -> str:
     return words if n else f"{words}; global is smoothed"
 
 
+def imu_words(summary: Mapping[str, Any]) -> str:
+    """Say how often and how long an IMU carried the camera, or why not; empty without one."""
+    imu = summary.get("imu")
+    if imu is None:
+        return ""
+    if not imu["has_started"]:
+        return f"the IMU {imu['name']} was not used: {imu['reason']}"
+    n, n_restarts, sum_s = imu["n_gaps"], imu["n_restarts"], f"{imu['carried_s']:.2g} s"
+    words = ["the IMU had nothing to carry"]
+    if n:
+        longest_s = f" in all, {imu['longest_s']:.2g} s at the longest" if n > 1 else ""
+        words = [f"the IMU carried the camera {_times(n)}, {sum_s}{longest_s}"]
+    if n_restarts:
+        words.append(f"it began anew {_times(n_restarts)}: {imu['reason']}")
+    if imu["is_delay_learnt"]:
+        words.append(f"its delay of {imu['delay_ms']:.2g} ms was learnt")
+    return "; ".join(words)
+
+
+def _times(n: int) -> str:
+    return "once" if n == 1 else f"{n} times"
+
+
 def _how_calibrated(offsets: Mapping[str, Any]) -> str:
     if not (px := offsets.get("calibration_px")):
         return ""

@@ -29,7 +29,16 @@ from gvo.trajectory.formats import (
 )
 from gvo.trajectory.g2o import format_edge, format_vertex
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Estimate, FaultyFrame, FloatArray, FrameResult, IntArray, Optimum, Status
+from gvo.types import (
+    Estimate,
+    FaultyFrame,
+    FloatArray,
+    FrameResult,
+    InertialState,
+    IntArray,
+    Optimum,
+    Status,
+)
 
 SUMMARY = "summary.json"
 RIG = "rig.yaml"
@@ -55,6 +64,15 @@ FRAMES_HEADER = (
     *("n_keypoints", "n_points", "n_matches", "n_inliers", "n_links"),
     "reason",
 )
+INERTIAL = "inertial.csv"
+INERTIAL_HEADER = (
+    *("stamp_ns", "is_carried"),
+    *(f"v{axis}_mps" for axis in "xyz"),
+    *(f"up_{axis}" for axis in "xyz"),
+    *(f"gyro_bias_{axis}_radps" for axis in "xyz"),
+    *(f"acceleration_bias_{axis}_mps2" for axis in "xyz"),
+    *("sigma_v_mps", "sigma_up_rad", "sigma_gyro_bias_radps", "sigma_acceleration_bias_mps2"),
+)
 EDGES_HEADER = ("stamp_ns", "reference_ns", "kind", "is_accepted", "chi2")
 _STAGES = ("read", "extract", "register", "links", "window", "loops")
 TIMINGS_HEADER = ("stamp_ns", *(f"{stage}_ms" for stage in _STAGES))
@@ -62,7 +80,7 @@ TIMINGS_HEADER = ("stamp_ns", *(f"{stage}_ms" for stage in _STAGES))
 _RIG_HEADER = "# What was learnt of this camera: `gvo run RECORDING --rig FILE` starts from it."
 
 _RESULTS = (
-    *(SUMMARY, RIG, "edges.csv", "timings.csv", PICTURE, REPORT),
+    *(SUMMARY, RIG, "edges.csv", "timings.csv", INERTIAL, PICTURE, REPORT),
     *(TRUTH, TRUE_POSITIONS, EFFECTS, GRAPH, LOOPS, f"{GLOBAL}.txt"),
     "frames.csv",
     *(f"{name}.txt" for name in TRAJECTORIES),
@@ -149,7 +167,7 @@ def _remove_empty(folder: Path) -> None:
 
 
 class RunFolder(AbstractContextManager["RunFolder"]):
-    """Trajectories, covariances and the tables of frames, edges and times, line by line.
+    """Trajectories, covariances and the tables of frames, edges, times and IMU, line by line.
 
     Smoothed poses come in the order in which they leave the window; `close` sorts them by stamp.
     Whatever stops the process, the files hold whole lines; only a power failure can cut one off.
@@ -228,7 +246,19 @@ class RunFolder(AbstractContextManager["RunFolder"]):
         times_ms = map(result.stage_ms.get, _STAGES)
         times = ("" if time_ms is None else f"{time_ms:.3f}" for time_ms in times_ms)
         self._write("timings.csv", _csv_line((result.stamp_ns, *times)))
+        if result.inertial is not None:
+            self._add_inertial(result.inertial, is_carried=result.is_carried)
         self.add_smoothed(result.finished)
+
+    def _add_inertial(self, state: InertialState, *, is_carried: bool) -> None:
+        """Write what the IMU tells of a frame; the file begins with the first of them."""
+        if INERTIAL not in self._files:
+            with self._refused_on_error(self.path / INERTIAL):
+                self._open(INERTIAL, _csv_line(INERTIAL_HEADER))
+        biases = *state.gyro_bias, *state.acceleration_bias
+        values = *state.velocity, *state.up, *biases, state.velocity_sigma, *state.sigmas
+        row = (f"{value:.9g}" for value in values)
+        self._write(INERTIAL, _csv_line((state.stamp_ns, int(is_carried), *row)))
 
     def add_poses(self, raw: Estimate, causal: Estimate, row: Sequence[object]) -> None:
         """Write both poses of a frame as it arrives, and its row of the table."""

@@ -1,5 +1,8 @@
 """Rendered recordings with exact ground truth."""
 
+from gvo.io.synthetic.imu import ImuKind as ImuKind
+from gvo.io.synthetic.imu import RenderedImu as RenderedImu
+from gvo.io.synthetic.imu import rendered_imu as rendered_imu
 from gvo.io.synthetic.recording import SyntheticRecording as SyntheticRecording
 from gvo.io.synthetic.rendering import StillScene as StillScene
 from gvo.io.synthetic.rig_error import RigError as RigError

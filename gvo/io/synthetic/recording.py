@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo.geometry.camera import Calibration
+from gvo.geometry.imu import ImuStream
 from gvo.geometry.se3 import invert, make_transform
 from gvo.io.recording import RecordingInfo, Sensor, StampedImage, shown
+from gvo.io.synthetic.imu import RenderedImu
 from gvo.io.synthetic.rendering import scale_camera, to_uint8
 from gvo.io.synthetic.rig_error import BentRig, RigError
 from gvo.io.synthetic.sensor import SensorNoise, expose, spoil_depth
@@ -55,6 +57,8 @@ class SyntheticRecording:
     rig_error : RigError, optional
         Images, and depth, are those of a rig that differs from the ideal one, whose calibration
         and ground truth are given.
+    imu : RenderedImu, optional
+        An IMU beside the camera, see `rendered_imu`.
 
     Raises
     ------
@@ -79,6 +83,7 @@ class SyntheticRecording:
         noise: SensorNoise | None = None,
         readout_ms: float = 0.0,
         rig_error: RigError | None = None,
+        imu: RenderedImu | None = None,
     ) -> None:
         _check(world, sensor, n_frames, seed, scale)
         self._world = world if isinstance(world, World) else WORLDS[world]
@@ -97,6 +102,7 @@ class SyntheticRecording:
         if rig_error is not None:
             constants = rig_error.draw(self._camera, is_stereo=sensor == "stereo")
             self._bent = BentRig(self._camera, self._world.baseline_m, constants)
+        self._imu = imu
 
     @property
     def info(self) -> RecordingInfo:
@@ -109,7 +115,15 @@ class SyntheticRecording:
             calibrations=(left, right) if self._sensor == "stereo" else (left,),
             n_images=len(self._elapsed_ns),
             decisions=[f"rendered: world {self._world.name}, seed {self._seed}"],
+            imu=self._stream(),
         )
+
+    def _stream(self) -> ImuStream | None:
+        if self._imu is None:
+            return None
+        length_s = self._elapsed_s(-1)
+        samples = partial(self._imu.samples, self._move, _START_NS, length_s, self._seed)
+        return ImuStream(name="rendered", imu=self._imu.imu, samples=lambda _: samples())
 
     __repr__ = shown
 

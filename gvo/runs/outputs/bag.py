@@ -27,9 +27,11 @@ Global poses come at the end, with their own stamps. Loops are drawn when they a
 between the causal poses of their frames (namespace `causal`); at the end all that count, between
 the global ones (`global`).
 
-The velocity of an `Odometry` is that from the pose before, as far as it was known, to this one; 0
-where none was. Its covariance is that of the registration between the two, for the raw poses and
-those in `gvo/odom`; elsewhere, and where they coast, its diagonal is -1.
+The velocity of an `Odometry` is that of the base frame at the stamp by the IMU, where it knows it,
+for the raw and causal poses and those in `gvo/odom`, with its covariance. Otherwise it is that from
+the pose before, as far as it was known, to this one; 0 where none was. Its covariance is that of
+the registration between the two, for the raw poses and those in `gvo/odom`; elsewhere, and where
+they coast, its diagonal is -1.
 
 Smoothed poses of keyframes come late, when all that sees them has left the window. A tf buffer
 drops what is more than its cache time (10 s by default) behind; `Odometry` and the paths hold
@@ -68,8 +70,17 @@ from gvo.io.convert.bag_messages import (
 from gvo.io.run_folder.line_file import PartFile
 from gvo.runs.outputs import bag_messages as messages
 from gvo.runs.outputs.file import FileOutput
-from gvo.runs.outputs.frames import ODOM, RunFrames, twist_between
-from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Optimum, Status
+from gvo.runs.outputs.frames import ODOM, RunFrames, twist_of
+from gvo.types import (
+    Estimate,
+    FaultyFrame,
+    FloatArray,
+    Frame,
+    FrameResult,
+    InertialState,
+    Optimum,
+    Status,
+)
 from gvo.viz.overlay import draw_matches
 from gvo.viz.scene import GLOBAL, History, Scene, StampedPose, grey_values, placed_matches, scene
 from gvo.viz.scene import Path as PosePath
@@ -127,8 +138,9 @@ class RunMessages:
         seen = scene(result, self._history)
         self._write_odom(result)
         self._write_tf(seen.poses.items())
-        self._write_odometry("raw", result.raw, self._step_covariance(result, result.raw))
-        self._write_odometry("causal", result.causal)
+        covariance, inertial = self._step_covariance(result, result.raw), result.inertial
+        self._write_odometry("raw", result.raw, covariance, inertial)
+        self._write_odometry("causal", result.causal, None, inertial)
         self._last = result.raw
         self._write_matches(frame, result, seen)
         if "loops" in seen.lines:
@@ -191,7 +203,8 @@ class RunMessages:
         poses = frames.corrected(result.stamp_ns, T_world_base, self._T_odom_base)
         write_transforms(self._writer, "/tf", poses)
         estimate = replace(causal, T_world_frame=self._T_odom_base)
-        twist = twist_between(estimate, previous, self._step_covariance(result, causal))
+        covariance = self._step_covariance(result, causal)
+        twist = twist_of(estimate, previous, covariance, result.inertial)
         names = frames.odom, frames.base_by(ODOM)
         messages.write_odometry(self._writer, f"/gvo/{ODOM}/odometry", estimate, names, twist)
 
@@ -217,7 +230,11 @@ class RunMessages:
         return np.asarray(covariance + effects @ effects.T)
 
     def _write_odometry(
-        self, name: str, estimate: Estimate, step_covariance: FloatArray | None = None
+        self,
+        name: str,
+        estimate: Estimate,
+        step_covariance: FloatArray | None = None,
+        inertial: InertialState | None = None,
     ) -> None:
         previous = self._history.tracks[name].before(estimate.stamp_ns)
         messages.write_odometry(
@@ -225,7 +242,7 @@ class RunMessages:
             f"/gvo/{name}/odometry",
             estimate,
             (self._frames.world, self._frames.base_by(name)),
-            twist_between(estimate, previous, step_covariance),
+            twist_of(estimate, previous, step_covariance, inertial),
         )
 
     def _write_matches(self, frame: Frame, result: FrameResult, seen: Scene) -> None:

@@ -1,4 +1,4 @@
-"""Names of a run's frames, and velocities between poses."""
+"""Names of a run's frames, and velocities of poses."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from gvo.geometry import se3
 from gvo.io.bag.messages import bare
 from gvo.io.convert.bag_messages import FramePose
-from gvo.types import Estimate, FloatArray
+from gvo.types import Estimate, FloatArray, InertialState
 from gvo.viz.scene import ESTIMATES, GLOBAL, StampedPose
 
 ODOM: Final = "odom"
@@ -137,10 +137,15 @@ class Twist(NamedTuple):
     covariance: FloatArray | None
 
 
-def twist_between(
-    estimate: Estimate, previous: StampedPose | None, step_covariance: FloatArray | None
+def twist_of(
+    estimate: Estimate,
+    previous: StampedPose | None,
+    step_covariance: FloatArray | None,
+    inertial: InertialState | None,
 ) -> Twist:
-    """Return the velocity from the pose before to this one; 0 where none was."""
+    """Return the velocity by the IMU, else from the pose before to this one; 0 where none was."""
+    if inertial is not None:
+        return Twist(velocity=inertial.twist, covariance=inertial.twist_covariance)
     if previous is None:
         return Twist(velocity=np.zeros(6), covariance=None)
     elapsed_s = 1e-9 * (estimate.stamp_ns - previous.stamp_ns)

@@ -47,7 +47,7 @@ _PANELS = (
 )
 _UNKNOWN = "#999999"
 _FLOOR = 1e-3  # of the logarithmic axis
-_MARKERS = {"step": "o", "keyframe": "s", "depth": "^"}
+_MARKERS = {"step": "o", "keyframe": "s", "depth": "^", "imu": "D"}
 
 
 TITLES = {

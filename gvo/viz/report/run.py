@@ -13,7 +13,7 @@ from gvo._text import number_text
 from gvo.config import Config
 from gvo.errors import TrajectoryError
 from gvo.io.run_folder.reader import RunRecord, Table, loop_ends
-from gvo.io.run_folder.verdict import loop_words, nees_table, reference_words, verdict
+from gvo.io.run_folder.verdict import imu_words, loop_words, nees_table, reference_words, verdict
 from gvo.trajectory.alignment import AlignMode
 from gvo.trajectory.consistency import consistency, motions_of_chain
 from gvo.trajectory.evaluation import Evaluation, evaluate, evaluation_table
@@ -224,6 +224,7 @@ def _words(record: RunRecord) -> dict[str, Any]:
         "summary": summary,
         "verdict": verdict(summary) if "frames" in summary else "",
         "loop_words": loop_words(summary),
+        "imu_words": imu_words(summary),
         "nees": nees_table(summary.get("nees") or {}),
         "reference_words": reference_words(summary.get("reference")),
         "statuses": Counter(record.frames["status"]),

@@ -19,7 +19,7 @@ from gvo.viz.view.clouds import Cloud
 
 # Where in the scene each line hangs; what is below a hidden node is hidden.
 _PATHS = ("raw", "causal", "smoothed", "truth")
-_LINKS = ("step", "keyframe link", "depth", "refused")
+_LINKS = ("step", "keyframe link", "depth", "imu", "refused")
 _NODES = {
     **{name: f"/world/paths/{name}" for name in _PATHS},
     "keyframes": "/world/keyframes",

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from gvo.errors import ConfigurationError, RecordingError
 from gvo.geometry import se3
 from gvo.io.poses.base_frame import BaseFrame, mount_by_tf, parse_initial_pose
 from gvo.io.poses.tf import TfBuffer
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Edge, Estimate, FloatArray
+from gvo.types import Edge, Estimate, FloatArray, InertialState
 from tests.make.bags import add_transform
 from tests.make.results import estimate_at
 
@@ -178,6 +179,48 @@ def test_frames_that_tf_does_not_connect_are_refused_in_one_line(
     assert "\n" not in text
     for word in ("drive.bag", f"--frame {frame}", "--calibration", camera, *words):
         assert word in text
+
+
+@pytest.mark.parametrize("is_moving", [False, True])
+def test_what_an_imu_tells_of_the_camera_is_told_of_the_frame(is_moving: bool) -> None:
+    rng, stamp_ns = np.random.default_rng(6), STAMPS_NS[0]
+    way, swing = rng.normal(size=6), 0.3 * rng.normal(size=6) * is_moving
+    T_start, T_mount = random_transform(rng), random_transform(rng)
+
+    def mount(at_ns: int) -> tuple[FloatArray, bool]:
+        return T_mount @ se3.exp(swing * 1e-9 * (at_ns - stamp_ns)), False
+
+    def base_at(at_ns: int) -> FloatArray:
+        T_world_cam = T_start @ se3.exp(way * 1e-9 * (at_ns - stamp_ns))
+        return np.asarray(T_world_cam @ np.linalg.inv(mount(at_ns)[0]))
+
+    up_world, A = np.array([0.0, 0.6, 0.8]), rng.normal(size=(6, 6))
+    told = InertialState(
+        stamp_ns=stamp_ns,
+        twist=way,
+        twist_covariance=A @ A.T,
+        up=T_start[:3, :3].T @ up_world,
+        gyro_bias=np.ones(3),
+        acceleration_bias=np.ones(3),
+        sigmas=np.ones(3),
+    )
+    frame = BaseFrame("base", mount if is_moving else T_mount)
+    found = frame.apply_to_inertial(told)
+    assert found is not None
+    before, after = base_at(stamp_ns - 10_000), base_at(stamp_ns + 10_000)
+    R, step = before[:3, :3].T, (after - before)[:3, 3] / 2e-5
+    turn = Rotation.from_matrix(R @ after[:3, :3]).as_rotvec() / 2e-5
+    np.testing.assert_allclose(found.twist, [*turn, *(R @ step)], rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(found.velocity, found.twist[3:])
+    np.testing.assert_allclose(base_at(stamp_ns)[:3, :3] @ found.up, up_world, atol=1e-9)
+    # a velocity that is wrong by some amount is moved by the same lever
+    wrong = replace(told, twist=way + A[:, 0], twist_covariance=np.outer(A[:, 0], A[:, 0]))
+    moved = frame.apply_to_inertial(wrong)
+    assert moved is not None
+    error = moved.twist - found.twist
+    np.testing.assert_allclose(moved.twist_covariance, np.outer(error, error), atol=1e-9)
+    assert BaseFrame().apply_to_inertial(told) is told
+    assert frame.apply_to_inertial(None) is None
 
 
 @pytest.mark.parametrize("is_moving", [False, True])

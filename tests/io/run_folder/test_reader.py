@@ -9,10 +9,14 @@ import numpy as np
 import pytest
 
 from gvo.errors import GvoError, RecordingError, TrajectoryError
+from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.run_folder.reader import RunRecord, loop_ends, read_run
 from gvo.io.synthetic import SyntheticRecording
 from gvo.trajectory.formats import read_covariances, read_trajectory
+from gvo.types import FloatArray
 from tests.conftest import run_of
+from tests.make.blind_walk import BLIND, blind_walk, stamps_of, true_twists, true_ups
+from tests.make.rendered_walk import T_BASE_CAM
 
 N = 6
 
@@ -105,6 +109,47 @@ def test_a_damaged_file_of_effects_is_refused(copy: Path, content: bytes) -> Non
         read_run(copy)
 
 
+def columns(record: RunRecord, form: str) -> np.ndarray:
+    return np.stack([record.inertial[form.format(axis)] for axis in "xyz"], axis=1)
+
+
+@pytest.mark.parametrize("T_base_cam", [None, T_BASE_CAM])
+def test_what_the_imu_tells_of_a_frame_is_a_row_and_true(
+    T_base_cam: FloatArray | None, tmp_path: Path
+) -> None:
+    run_of(blind_walk(), tmp_path, base_frame=BaseFrame("base_link", T_base_cam))
+    T_base_cam = np.eye(4) if T_base_cam is None else T_base_cam
+    record, stamps_ns = read_run(tmp_path), stamps_of(blind_walk())
+    start = int(np.searchsorted(stamps_ns, record.inertial["stamp_ns"][0]))
+    assert 10 < start < 30
+    np.testing.assert_array_equal(record.inertial["stamp_ns"], stamps_ns[start:])
+    frames = np.arange(start, len(stamps_ns))
+    np.testing.assert_array_equal(record.inertial["is_carried"], np.isin(frames, BLIND))
+    times_s = 1e-9 * (stamps_ns - stamps_ns[0])[start:]
+    twists = true_twists(times_s, T_base_cam)
+    errors_mps = np.linalg.norm(columns(record, "v{}_mps") - twists[:, 3:], axis=1)
+    assert np.linalg.norm(twists[:, 3:], axis=1).mean() > 0.1
+    assert np.all(errors_mps < 4.0 * record.inertial["sigma_v_mps"])
+    assert np.median(errors_mps) < 0.02
+    cosines = np.sum(columns(record, "up_{}") * true_ups(times_s, T_base_cam), axis=1)
+    angles = np.arccos(np.minimum(cosines, 1.0))
+    assert np.all(angles < 4.0 * record.inertial["sigma_up_rad"])
+    assert angles[-1] < np.radians(1.5)
+    grown = record.inertial["sigma_v_mps"][np.isin(frames, BLIND)]
+    assert np.all(np.diff(grown) > 0.0)
+    # drawn by a normal distribution of 0.05 rad/s and 0.1 m/s^2
+    for form, most in (("gyro_bias_{}_radps", 0.2), ("acceleration_bias_{}_mps2", 0.4)):
+        biases = columns(record, form)
+        assert np.all(np.abs(biases) < most)
+        assert np.abs(biases).max() > 0.1 * most
+    assert np.all(np.diff(record.inertial["sigma_gyro_bias_radps"][[0, -1]]) < 0.0)
+
+
+def test_without_an_imu_there_is_no_such_file(folder: Path) -> None:
+    assert not (folder / "inertial.csv").exists()
+    assert read_run(folder).inertial == {}
+
+
 def test_loops_are_lines_between_their_poses(copy: Path) -> None:
     trajectory = read_run(copy).trajectories["global"]
     stamps_ns = trajectory.stamps_ns.tolist()
@@ -151,6 +196,8 @@ def test_positions_are_read_as_such_and_estimates_moved_to_their_point(copy: Pat
         ("timings.csv", "stamp_ns,read_ms\n1,fast\n", RecordingError, "fast"),
         ("timings.csv", "stamp_ns,read_ms\n1\n", RecordingError, "1 columns"),
         ("loops.csv", "stamp_ns,reference_ns\n1,2\n", RecordingError, "no column n_inliers"),
+        ("inertial.csv", "stamp_ns\n1\n", RecordingError, "no column is_carried"),
+        ("summary.json", '{"imu": {"name": "/imu"}}', RecordingError, "is damaged"),
         ("raw.txt", "0.000000000 1 2 3\n", TrajectoryError, "raw.txt:1: expected 8 columns, got 4"),
         ("raw.txt", "a b\n", TrajectoryError, "raw.txt:1"),
         ("raw.txt", "0.000000000 0 0 0 0 0 0 0\n", TrajectoryError, "raw.txt"),

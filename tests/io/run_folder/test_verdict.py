@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from gvo.io.run_folder.verdict import loop_words, nees_table, reference_words, verdict
+from gvo.io.run_folder.verdict import imu_words, loop_words, nees_table, reference_words, verdict
 
 
 def row(nees: float, *, error_m: float = 0.05, **changes: float) -> dict[str, Any]:
@@ -312,3 +312,35 @@ SAME = "global is smoothed"
 def test_loops_are_counted_in_a_line(told: dict[str, Any] | None, words: str) -> None:
     assert loop_words({"global": told}) == words
     assert loop_words({}) == ""
+
+
+IMU = {"name": "/imu", "has_started": True, "n_gaps": 0, "carried_s": 0.0, "longest_s": 0.0}
+IMU |= {"n_restarts": 0, "reason": "", "is_delay_learnt": False, "delay_ms": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        ({}, "the IMU had nothing to carry"),
+        (
+            {"n_gaps": 1, "carried_s": 0.533, "longest_s": 0.533},
+            "the IMU carried the camera once, 0.53 s",
+        ),
+        (
+            {"n_gaps": 3, "carried_s": 4.2, "longest_s": 2.5, "n_restarts": 1, "reason": "a hole"},
+            "the IMU carried the camera 3 times, 4.2 s in all, 2.5 s at the longest; it began anew "
+            "once: a hole",
+        ),
+        (
+            {"is_delay_learnt": True, "delay_ms": 4.13},
+            "the IMU had nothing to carry; its delay of 4.1 ms was learnt",
+        ),
+        (
+            {"has_started": False, "reason": "the accelerometer feels a gravity of 1 m/s^2"},
+            "the IMU /imu was not used: the accelerometer feels a gravity of 1 m/s^2",
+        ),
+    ],
+)
+def test_what_an_imu_did_is_told_in_a_line(told: dict[str, Any], words: str) -> None:
+    assert imu_words({"imu": IMU | told}) == words
+    assert imu_words({}) == ""

@@ -26,6 +26,7 @@ from gvo.types import (
     FloatArray,
     Frame,
     FrameResult,
+    InertialState,
     RelativePose,
     RgbdFrame,
     Status,
@@ -300,8 +301,7 @@ def test_the_velocity_leads_from_the_pose_before_to_this_one(bag: _Bag) -> None:
         for stamp_ns, message in bag.stamped(f"/gvo/{kind}/odometry"):
             before_ns = max((ns for ns in known if ns < stamp_ns), default=None)
             known.append(stamp_ns)
-            twist = message.twist.twist
-            velocity = [getattr(v, axis) for v in (twist.angular, twist.linear) for axis in "xyz"]
+            velocity = _velocity(message)
             if before_ns is None:
                 assert not any(velocity)
                 continue
@@ -334,6 +334,40 @@ def test_the_covariance_of_a_measured_velocity_is_that_of_the_registration(bag: 
     for kind in ("causal", "smoothed"):
         for _, message in bag.messages[f"/gvo/{kind}/odometry"]:
             np.testing.assert_array_equal(message.twist.covariance, -np.eye(6).ravel())
+
+
+def test_the_velocity_is_that_of_the_imu_where_it_knows_it(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    A = rng.normal(size=(6, 6))
+    state = InertialState(
+        stamp_ns=START_NS + SECOND_NS,
+        twist=rng.normal(size=6),
+        twist_covariance=A @ A.T,
+        up=np.array([0.0, 0.0, 1.0]),
+        gyro_bias=np.zeros(3),
+        acceleration_bias=np.zeros(3),
+        sigmas=np.ones(3),
+    )
+    with RunBag(tmp_path / "run.mcap", MOUNTED) as file:
+        for k, inertial in enumerate((None, state, None)):
+            changes: dict[str, Any] = {"inertial": inertial, "T_previous_frame": moved(0.1)}
+            pose = _add(file, START_NS + k * SECOND_NS, **changes)
+        file.add_smoothed([pose])
+    messages = read_bag(tmp_path / "run.mcap")
+    for kind in ("raw", "causal", "odom"):
+        _, (_, known), (_, after) = messages[f"/gvo/{kind}/odometry"]
+        np.testing.assert_array_equal(_velocity(known), state.twist)
+        covariance = known.twist.covariance.reshape(6, 6)
+        np.testing.assert_allclose(np.roll(covariance, (3, 3), axis=(0, 1)), A @ A.T, atol=1e-12)
+        assert not np.allclose(_velocity(after), state.twist)
+    ((_, late),) = messages["/gvo/smoothed/odometry"]
+    np.testing.assert_array_equal(late.twist.covariance, -np.eye(6).ravel())
+
+
+def _velocity(message: Any) -> list[float]:
+    """Return the angular and the linear velocity."""
+    twist = message.twist.twist
+    return [getattr(v, axis) for v in (twist.angular, twist.linear) for axis in "xyz"]
 
 
 def test_points_are_those_matched_in_grey(bag: _Bag) -> None:

@@ -135,6 +135,13 @@ def test_loops_are_counted_drawn_and_listed(copy: Path, page: Path) -> None:
     assert "70 more are in loops.csv" in table
 
 
+def test_what_an_imu_did_is_said(copy: Path, page: Path) -> None:
+    assert "the IMU" not in page.read_text()
+    imu = {"has_started": False, "name": "/imu", "reason": "a <b> hole"}
+    rewrite_summary(copy, imu=imu)
+    assert "<p>the IMU /imu was not used: a &lt;b&gt; hole.</p>" in page_of(copy)
+
+
 def test_positions_without_rotations_leave_out_what_needs_rotations(copy: Path) -> None:
     truth = read_run(copy).truth
     assert truth is not None

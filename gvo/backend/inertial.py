@@ -1,0 +1,431 @@
+"""An IMU beside the window: it says how the camera moved where nothing else does."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from typing import Final
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+
+from gvo.backend.factors import first_line
+from gvo.backend.imu_alignment import Alignment
+from gvo.backend.imu_buffer import ImuBuffer
+from gvo.backend.imu_motion import Bias, Front, Preintegrator, step_covariance
+from gvo.backend.imu_start import Start, find_start
+from gvo.geometry import se3
+from gvo.geometry.imu import GRAVITY, Imu, ImuSamples
+from gvo.types import Edge, Failure, FloatArray, InertialState
+
+_LOGGER = logging.getLogger(__name__)
+
+_G: Final = gtsam.symbol("g", 0)
+# States of so many measured frames are estimated together. All up to so many, while the direction
+# of gravity is less sure than this, rad: what leaves fixes where it is linearized.
+_N_STATES, _N_UNSURE, _UPRIGHT = 3, 20, 0.01
+# Registered frames that it starts from.
+_N_START = 15
+# Of the first state: sigmas of velocity (m/s), direction of gravity (rad), biases (m/s^2, rad/s).
+_VELOCITY, _TILT, _ACCELERATION_BIAS, _GYRO_BIAS = 1.0, 0.1, 0.3, 0.05
+# A step contradicts the IMU from so many sigmas on, per degree of freedom; after so many in a row
+# it is the IMU that is wrong.
+_GATE, _N_CONTRADICTIONS = 5.0, 6
+# Of durations, seconds.
+_ROUNDING_S = 1e-7
+# A camera that moves no faster, m/s, or not more sigmas than this, may be at rest.
+_REST_SPEED, _REST_SIGMAS = 0.02, 3.0
+
+
+class InertialEstimator:
+    """Estimates velocity, gravity and biases from visual steps and an IMU; predicts motions.
+
+    States are poses of the IMU in a world of their own, which begins at the first of them. Nothing
+    here acts on the window but what `carry` returns. It begins anew where the IMU has a hole,
+    where steps contradict it one after the other, and where GTSAM fails.
+
+    Parameters
+    ----------
+    imu : Imu
+        A rotation or delay that is not known is learnt before it starts.
+    max_coast_s : float
+        See there.
+
+    Attributes
+    ----------
+    max_coast_s : float
+        From the newest measured frame, seconds; what is asked later is unknown.
+    carried_ns : int
+        The latest frame that it carried the camera to, as the window says; 0 before the first.
+    imu : Imu
+        With what was learnt.
+    n_restarts : int
+    reason : str
+        Why it has not started, or began anew the last time.
+    """
+
+    def __init__(self, imu: Imu, *, max_coast_s: float) -> None:
+        self.max_coast_s = max_coast_s
+        self._buffer = ImuBuffer()
+        self._integrate = Preintegrator(imu, self._buffer)
+        self._audit = _Audit()
+        self._n_contradictions = 0
+        self.n_restarts = self.carried_ns = 0
+        self.reason = "how it sits in the camera and how late it is could not be learnt"
+        self._alignment: Alignment | None = None
+        self.imu = imu
+        if imu.T_camera_imu is None or imu.delay_s is None:
+            self._alignment = Alignment(imu)
+        else:
+            self._place(imu)
+        self._begin()
+
+    def _place(self, imu: Imu) -> None:
+        self.imu = imu
+        self.reason = f"no {_N_START} frames in a row could be registered"
+        self._T_camera_imu = np.eye(4) if imu.T_camera_imu is None else imu.T_camera_imu
+        self._T_imu_camera = se3.invert(self._T_camera_imu)
+        self._buffer.delay_ns = round(1e9 * (imu.delay_s or 0.0))
+
+    def _begin(self) -> None:
+        # Frames registered one after the other, with the steps that lead to them: until it starts.
+        self._waiting: list[tuple[int, Edge | None]] = []
+        # Afterwards: where the newest measured frame is, and those after it.
+        self._fronts: list[Front] = []
+        self._isam = gtsam.ISAM2()
+        self._alive: list[int] = []
+        self._n = self._oldest = self._n_kept = 0
+        self._audit.begin(None)
+
+    @property
+    def state(self) -> InertialState | None:
+        """What is known of the camera at the newest frame; None where nothing is."""
+        if not self._fronts or self._is_too_late(self._fronts[-1].stamp_ns):
+            return None
+        front, T = self._fronts[-1], self._T_camera_imu
+        found = self._integrate.twist(front)
+        if found is None:
+            return None
+        twist, covariance = found
+        up, sigma = front.up
+        acceleration, gyro = front.covariance.diagonal()[9:15].reshape(2, 3).max(axis=1)
+        return InertialState(
+            stamp_ns=front.stamp_ns,
+            twist=se3.adjoint(T) @ twist,
+            twist_covariance=se3.transport_covariance(covariance, T),
+            up=T[:3, :3] @ up,
+            gyro_bias=front.bias.gyroscope(),
+            acceleration_bias=front.bias.accelerometer(),
+            sigmas=np.array([sigma, np.sqrt(gyro), np.sqrt(acceleration)]),
+        )
+
+    def add(self, samples: ImuSamples) -> None:
+        """Add samples, before the frames that they lead to."""
+        self._buffer.add(samples)
+
+    def follow(self, stamp_ns: int, step: Edge | None) -> None:
+        """Take the next frame.
+
+        Parameters
+        ----------
+        stamp_ns : int
+        step : Edge or None
+            By vision, from an earlier frame named by its stamp; None where vision is silent.
+        """
+        if self._alignment is not None:
+            self._align(self._alignment, stamp_ns, step)
+        if self.imu.T_camera_imu is None or self.imu.delay_s is None:
+            if self._alignment is None:  # learnt in vain
+                self._buffer.drop(stamp_ns)
+            return
+        step = None if step is None else self._of_imu(step)
+        try:
+            if self._fronts:
+                self._go_on(stamp_ns, step)
+            else:
+                self._wait(stamp_ns, step)
+        except RuntimeError as error:
+            self._restart(stamp_ns, f"GTSAM: {first_line(error)}")
+        oldest_ns = [front.stamp_ns for front in self._fronts] + [ns for ns, _ in self._waiting]
+        if self._alignment is not None and self._alignment.oldest_ns is not None:
+            oldest_ns.append(self._alignment.oldest_ns)
+        self._buffer.drop(min([stamp_ns, *oldest_ns]))
+
+    def carry(self, reference_ns: int, stamp_ns: int) -> Edge | None:
+        """Return the motion of the camera from an earlier frame, with its covariance.
+
+        None where it is unknown: the reference must be the newest measured frame or a later one.
+        One after the other, such edges add up to the covariance of the whole way: errors of the IMU
+        last.
+        """
+        known = {front.stamp_ns: front for front in self._fronts}
+        start = known.get(reference_ns)
+        if start is None or self._is_too_late(stamp_ns):
+            return None
+        end = known.get(stamp_ns) or self._integrate.advance(self._fronts[-1], stamp_ns)
+        if end is None:
+            return None
+        T, covariance = self._motion(start, end)
+        covariance = se3.transport_covariance(covariance, self._T_camera_imu)
+        return Edge(
+            reference_id=start.stamp_ns,
+            T_reference_frame=se3.normalize(self._T_camera_imu @ T @ self._T_imu_camera),
+            covariance=0.5 * (covariance + covariance.T),
+            kernel="none",
+        )
+
+    def _is_too_late(self, stamp_ns: int) -> bool:
+        return stamp_ns - self._fronts[0].stamp_ns > 1e9 * self.max_coast_s
+
+    def _motion(self, start: Front, end: Front) -> tuple[FloatArray, FloatArray]:
+        """Return the pose of the IMU at a front in that at another, and its covariance."""
+        T = se3.invert(start.T_world_imu) @ end.T_world_imu
+        covariance = end.pose_covariance
+        if start is not self._fronts[0]:
+            covariance = step_covariance(start.pose_covariance, T, covariance)
+        return T, self._audit.factor * covariance
+
+    def _of_imu(self, step: Edge) -> Edge:
+        """Return a step of the camera as one of the IMU."""
+        T = self._T_imu_camera @ step.T_reference_frame @ self._T_camera_imu
+        covariance = se3.transport_covariance(step.covariance, self._T_imu_camera)
+        covariance = 0.5 * (covariance + covariance.T)
+        return replace(step, T_reference_frame=T, covariance=covariance)
+
+    def _restart(self, stamp_ns: int, reason: str) -> None:
+        _LOGGER.info("the IMU begins anew at %d: %s", stamp_ns, reason)
+        self.n_restarts += 1
+        self.reason = reason
+        self._begin()
+        self._wait(stamp_ns, None)
+
+    # Before it has started
+
+    def _align(self, alignment: Alignment, stamp_ns: int, step: Edge | None) -> None:
+        """Learn how the IMU sits and how late it is; begin anew with what is known better."""
+        found = alignment.follow(step, stamp_ns, self._buffer)
+        if found is not None:
+            _LOGGER.info("the IMU is %s", found)
+            self._place(found)
+            self._begin()
+            for ns, each in alignment.steps[-_N_START:-1]:
+                self._wait(ns, self._of_imu(each))
+        if alignment.is_done:
+            self._alignment = None
+
+    def _wait(self, stamp_ns: int, step: Edge | None) -> None:
+        """Collect frames that are registered one after the other; start when they are enough."""
+        is_next = step is not None and self._waiting and self._waiting[-1][0] == step.reference_id
+        if not is_next:
+            self._waiting = []
+        self._waiting.append((stamp_ns, step))
+        if len(self._waiting) >= _N_START:
+            self._start()
+
+    def _start(self) -> None:
+        """Take the frames so far, if they tell gravity."""
+        stamps_ns = [ns for ns, _ in self._waiting]
+        steps = [step for _, step in self._waiting[1:] if step is not None]
+        found = find_start(stamps_ns, steps, self._integrate)
+        if isinstance(found, Failure):  # tried again when half of them are new
+            self.reason = found.reason
+            _LOGGER.info("the IMU is not used yet: %s", found.reason)
+            self._waiting = self._waiting[_N_START // 2 :]
+            return
+        self._waiting = []
+        self._put_first(stamps_ns[0], found)
+        for stamp_ns, step in zip(stamps_ns[1:], steps, strict=True):
+            if self._fronts:
+                self._go_on(stamp_ns, step)
+
+    def _put_first(self, stamp_ns: int, start: Start) -> None:
+        """Put the first state into a new graph."""
+        direction = gtsam.Unit3(start.gravity / np.linalg.norm(start.gravity))
+        bias, values = Bias(np.zeros(3), start.gyro_bias), gtsam.Values()
+        values.insert(X(0), gtsam.Pose3())
+        values.insert(V(0), start.velocity)
+        values.insert(B(0), bias)
+        values.insert(_G, direction)
+        of_biases = np.repeat([_ACCELERATION_BIAS, _GYRO_BIAS], 3)
+        sigmas = [np.full(6, 1e-5), np.full(3, _VELOCITY), of_biases, np.full(2, _TILT)]
+        exact, of_velocity, of_bias, tilt = map(gtsam.noiseModel.Diagonal.Sigmas, sigmas)
+        graph = gtsam.NonlinearFactorGraph()
+        graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), exact))
+        graph.add(gtsam.PriorFactorVector(V(0), start.velocity, of_velocity))
+        graph.add(gtsam.PriorFactorConstantBias(B(0), bias, of_bias))
+        graph.add(gtsam.PriorFactorUnit3(_G, direction, tilt))
+        parameters = gtsam.ISAM2Params()
+        parameters.setFactorization("QR")  # Cholesky fails sooner or later
+        parameters.setRelinearizeThreshold(0.01)
+        parameters.relinearizeSkip = 1
+        parameters.findUnusedFactorSlots = True
+        self._isam = gtsam.ISAM2(parameters)
+        self._isam.update(graph, values)
+        self._alive, self._n, self._oldest = [_G, X(0), V(0), B(0)], 0, 0
+        self._n_kept = _N_UNSURE
+        self._read(stamp_ns)
+
+    # Afterwards
+
+    def _go_on(self, stamp_ns: int, step: Edge | None) -> None:
+        end = self._integrate.advance(self._fronts[-1], stamp_ns)
+        if end is None:
+            self._restart(stamp_ns, "a hole in the IMU")
+            return
+        known = {front.stamp_ns: front for front in self._fronts}
+        self._fronts.append(end)
+        if step is None or step.reference_id not in known:
+            return
+        start = known[step.reference_id]
+        if self._is_contradicted(start, end, step):
+            self._n_contradictions += 1
+            if self._n_contradictions >= _N_CONTRADICTIONS:
+                self._n_contradictions = 0
+                self._restart(stamp_ns, "it is contradicted by vision")
+            return
+        self._n_contradictions = 0
+        if start is not self._fronts[0]:
+            self._add(start, None)
+            end = self._integrate.advance(self._fronts[0], stamp_ns)
+        if end is not None:
+            self._add(end, step)
+            self._audit.follow(self._fronts[0], step, self._integrate)
+
+    def _is_contradicted(self, start: Front, end: Front, step: Edge) -> bool:
+        """Tell whether a step of the IMU is another than predicted."""
+        T, covariance = self._motion(start, end)
+        difference = se3.log(se3.invert(T) @ step.T_reference_frame)
+        squares = se3.mahalanobis(difference, covariance + step.covariance)
+        return bool(squares > 6.0 * _GATE**2)
+
+    def _add(self, end: Front, step: Edge | None) -> None:
+        """Make a front the newest state, measured by a step from the newest one or not."""
+        n, start = self._n + 1, self._fronts[0]
+        motion = end.motion
+        if (
+            motion is None
+            or motion.deltaTij() < 1e-9 * (end.stamp_ns - start.stamp_ns) - _ROUNDING_S
+        ):
+            motion = self._integrate.between(start.stamp_ns, end.stamp_ns, start.bias)
+        if motion is None:
+            self._restart(end.stamp_ns, "a hole in the IMU")
+            return
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        keys = X(n - 1), V(n - 1), X(n), V(n), B(n - 1), B(n), _G
+        graph.add(gtsam.CombinedImuFactorWithGravityDirection(*keys, motion, GRAVITY))
+        if step is not None:
+            noise = gtsam.noiseModel.Gaussian.Covariance(step.covariance)
+            T = gtsam.Pose3(step.T_reference_frame)
+            graph.add(gtsam.BetweenFactorPose3(X(n - 1), X(n), T, noise))
+        values.insert(X(n), end.navigation.pose())
+        values.insert(V(n), end.navigation.velocity())
+        values.insert(B(n), start.bias)
+        self._update(graph, values, n)
+        self._read(end.stamp_ns)
+        speed, sigma = self._fronts[0].speed
+        if speed < max(_REST_SPEED, _REST_SIGMAS * sigma):
+            is_resting = self._integrate.is_still(start, motion)
+            self._fronts[0] = replace(self._fronts[0], is_resting=is_resting)
+
+    def _update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, n: int) -> None:
+        """Smooth the states, and let old ones leave."""
+        new, end = [X(n), V(n), B(n)], min(self._oldest + 2, n - self._n_kept + 1)
+        leaving = [key(k) for k in range(self._oldest, end) for key in (V, B, X)]
+        constrained, reeliminated = gtsam.KeyGroupMap(), gtsam.KeyList()
+        for key in (*self._alive, *new):  # what leaves must be leaves of the tree: each in a group
+            group = leaving.index(key) if key in leaving else len(leaving)
+            constrained.insert2(key, group)
+        for key in self._alive:
+            reeliminated.push_back(key)
+        self._isam.update(graph, values, [], constrained, None, reeliminated, False)
+        for key in leaving:
+            leaf = gtsam.KeyList()
+            leaf.push_back(key)
+            self._isam.marginalizeLeaves(leaf)
+        self._alive = [key for key in self._alive if key not in leaving] + new
+        self._n, self._oldest = n, max(end, self._oldest)
+
+    def _read(self, stamp_ns: int) -> None:
+        """Read the newest state, which predictions start from."""
+        n, isam = self._n, self._isam
+        velocity = np.asarray(isam.calculateEstimateVector(V(n)))
+        gravity = isam.calculateEstimate().atUnit3(_G)
+        axes, down = GRAVITY * np.asarray(gravity.basis()), GRAVITY * np.asarray(gravity.point3())
+        T_world_imu, covariance = isam.calculateEstimatePose3(X(n)), np.zeros((17, 17))
+        # Seen from the pose: where the way began is forgotten, and its turn turns the rest along.
+        seen, R = np.eye(17)[6:], T_world_imu.rotation().matrix()
+        seen[:3, :3] = se3.skew(velocity) @ R
+        seen[9:, :3] = axes.T @ se3.skew(down) @ R / GRAVITY**2
+        joint = isam.jointMarginalCovariance([X(n), V(n), B(n), _G]).fullMatrix()
+        covariance[6:, 6:] = seen @ joint @ seen.T
+        front = Front(
+            stamp_ns=stamp_ns,
+            navigation=gtsam.NavState(T_world_imu, velocity),
+            covariance=covariance,
+            bias=isam.calculateEstimateConstantBias(B(n)),
+            gravity=down,
+            gravity_axes=axes,
+        )
+        self._fronts = [front]
+        if self._n_kept > _N_STATES and (n >= _N_UNSURE or front.up[1] < _UPRIGHT):
+            self._n_kept = _N_STATES
+
+
+# Time over which the IMU is compared with vision, comparisons that the factor rests on, and for how
+# many of them one counts that is presumed.
+_AUDIT_NS, _N_AUDITS, _PRESUMED = 1_000_000_000, 20.0, 3.0
+# Bounds of the factor.
+_LEAST_FACTOR, _LARGEST_FACTOR = 0.25, 25.0
+
+
+class _Audit:
+    """Compares what the IMU predicted over a second with what vision saw.
+
+    Attributes
+    ----------
+    factor : float
+        By which predicted covariances are wrong.
+    """
+
+    def __init__(self) -> None:
+        self.factor = 1.0
+        self._sum = self._weight = _PRESUMED
+        self._start: Front | None = None
+        self._end_ns = 0
+
+    def begin(self, front: Front | None) -> None:
+        """Begin to compare from a front on."""
+        self._start, self._T_start_end = front, np.eye(4)
+        self._end_ns = 0 if front is None else front.stamp_ns
+
+    def follow(self, front: Front, step: Edge, integrate: Preintegrator) -> None:
+        """Take the step to the newest state."""
+        start = self._start
+        if start is None or step.reference_id != self._end_ns:
+            self.begin(front)
+            return
+        self._T_start_end, self._end_ns = self._T_start_end @ step.T_reference_frame, front.stamp_ns
+        if front.stamp_ns - start.stamp_ns >= _AUDIT_NS:
+            predicted = integrate.advance(start, front.stamp_ns)
+            if predicted is not None:
+                # Steps lead between poses that do not drift apart: both ends are wrong by one.
+                self._judge(start, predicted, 2.0 * step.covariance)
+            self.begin(front)
+
+    def _judge(self, start: Front, predicted: Front, seen: FloatArray) -> None:
+        """Find the factor f of C so that differences have the covariance f C + that of vision.
+
+        Along the axes that both have in common: weighed by how much vision tells there.
+        """
+        T = se3.invert(start.T_world_imu) @ predicted.T_world_imu
+        difference = se3.log(se3.invert(T) @ self._T_start_end)
+        L_inverse = np.linalg.inv(np.linalg.cholesky(predicted.pose_covariance))
+        ratios, axes = np.linalg.eigh(L_inverse @ seen @ L_inverse.T)
+        squares = (axes.T @ L_inverse @ difference) ** 2
+        weights = 1.0 / (1.0 + ratios) ** 2
+        share = weights.sum() / 6.0
+        keep = 1.0 - share / _N_AUDITS
+        self._sum = keep * self._sum + float(weights @ (squares - ratios)) / 6.0
+        self._weight = keep * self._weight + share
+        self.factor = min(max(self._sum / self._weight, _LEAST_FACTOR), _LARGEST_FACTOR)
