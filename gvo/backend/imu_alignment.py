@@ -26,6 +26,7 @@ from gvo.types import Edge, FloatArray, IntArray
 MAX_DELAY_S = 0.1
 """Delays are sought between minus this and this."""
 
+# Distance of the delays that are tried first, and by which the error's bend is found, seconds.
 _GRID_S, _BEND_S = 0.005, 0.0025
 # Steps are added up over so long, and so many of these sums tell at least.
 _SPAN_NS, _FEWEST = 200_000_000, 8
@@ -54,9 +55,9 @@ class Turns(NamedTuple):
 
     @classmethod
     def of(cls, steps: Iterable[tuple[int, Edge]]) -> Turns:
-        """Return those of steps, with the stamps of their ends: of some that follow each other.
+        """Return those of steps, given with the stamps of their ends, in sums over 0.2 s.
 
-        What is wrong with a frame cancels in the steps to it and from it.
+        Of steps that follow each other, what is wrong with the frame between them cancels.
         """
         spans: list[list[int]] = []
         turns: list[FloatArray] = []
@@ -289,5 +290,5 @@ class Alignment:
 def _differs(one: Aligned, other: Aligned) -> bool:
     """Tell whether two alignments differ by more than it costs to begin anew."""
     R = one.R_camera_imu.T @ other.R_camera_imu
-    turn = float(se3.rotation_angle(se3.make_transform(R, np.zeros(3))))
+    turn = float(se3.rotation_angle(R))
     return turn > _OTHER_TURN or abs(one.delay_s - other.delay_s) > _OTHER_DELAY_S

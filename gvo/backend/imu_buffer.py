@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gvo.geometry.imu import ImuSamples
+from gvo.geometry.imu import HOLE_S, ImuSamples
 from gvo.types import FloatArray, IntArray
 
-# Seconds between samples that are one hole: what was measured in it is lost.
-HOLE_S = 0.1
 # No IMU measures as much: m/s^2 and rad/s.
 _LARGEST = 1e4
 

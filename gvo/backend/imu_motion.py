@@ -26,7 +26,7 @@ Bias: TypeAlias = gtsam.imuBias.ConstantBias
 _INFLATION = 3.0
 # Longer intervals are linearized in pieces, nanoseconds.
 _LONGEST_NS = 200_000_000
-# Angular velocity is that over so long a time around a frame, nanoseconds.
+# The angular velocity at a frame is the mean over so long around it, nanoseconds.
 _NOW_NS = 5_000_000
 # What the IMU feels at rest, beside so many sigmas of its noise: m/s^2 and rad/s.
 _STILL_ACCELERATION, _STILL_TURN, _STILL_SIGMAS = 0.05, 0.02, 5.0
@@ -38,9 +38,9 @@ _LEAST_SHARE = 1e-4
 class Front:
     """Where the IMU is at a frame, by what is known at the newest measured one.
 
-    `motion` is what the IMU measured since the front before, which may be the newest measured one.
-    `covariance` (17, 17) is that of (rotation in its own axes, position, velocity, biases of
-    acceleration and gyro, gravity along `gravity_axes`), given the pose of the newest measured one.
+    `motion` is what the IMU measured since `since_ns`. `covariance` (17, 17) is that of (rotation
+    in its own axes, position, velocity, biases of acceleration and gyro, gravity along
+    `gravity_axes`), as seen from the newest measured one.
     """
 
     stamp_ns: int
@@ -50,6 +50,7 @@ class Front:
     gravity: FloatArray
     gravity_axes: FloatArray
     motion: Motion | None = None
+    since_ns: int = 0
     is_resting: bool = False
 
     @property
@@ -146,7 +147,7 @@ class Preintegrator:
         """Tell whether the IMU felt nothing but gravity."""
         t, imu = motion.deltaTij(), self._imu
         acceleration = front.R_world_imu @ motion.deltaVij() / t + front.gravity
-        turn, n_sigmas = np.linalg.norm(turn_of(motion)) / t, _STILL_SIGMAS / np.sqrt(t)
+        turn, n_sigmas = se3.rotation_angle(rotation_of(motion)) / t, _STILL_SIGMAS / np.sqrt(t)
         most = _STILL_ACCELERATION + n_sigmas * imu.acceleration_noise
         is_still = np.linalg.norm(acceleration) < most
         return bool(is_still and turn < _STILL_TURN + n_sigmas * imu.gyro_noise)
@@ -170,13 +171,9 @@ def _moved(front: Front, stamp_ns: int, motion: Motion, *, is_resting: bool) -> 
         navigation=gtsam.NavState(gtsam.Pose3(predicted.attitude(), position), velocity),
         covariance=F @ front.covariance @ F.T + Q,
         motion=motion,
+        since_ns=front.stamp_ns,
         is_resting=is_resting,
     )
-
-
-def turn_of(motion: Motion) -> FloatArray:
-    """Return the rotation vector (3,) of a motion."""
-    return se3.log(se3.make_transform(rotation_of(motion), np.zeros(3)))[:3]
 
 
 def rotation_of(motion: Motion) -> FloatArray:

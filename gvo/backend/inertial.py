@@ -32,8 +32,6 @@ _VELOCITY, _TILT, _ACCELERATION_BIAS, _GYRO_BIAS = 1.0, 0.1, 0.3, 0.05
 # A step contradicts the IMU from so many sigmas on, per degree of freedom; after so many in a row
 # it is the IMU that is wrong.
 _GATE, _N_CONTRADICTIONS = 5.0, 6
-# Of durations, seconds.
-_ROUNDING_S = 1e-7
 # A camera that moves no faster, m/s, or not more sigmas than this, may be at rest.
 _REST_SPEED, _REST_SIGMAS = 0.02, 3.0
 
@@ -85,7 +83,6 @@ class InertialEstimator:
         self.imu = imu
         self.reason = f"no {_N_START} frames in a row could be registered"
         self._T_camera_imu = np.eye(4) if imu.T_camera_imu is None else imu.T_camera_imu
-        self._T_imu_camera = se3.invert(self._T_camera_imu)
         self._buffer.delay_ns = round(1e9 * (imu.delay_s or 0.0))
 
     def _begin(self) -> None:
@@ -147,7 +144,8 @@ class InertialEstimator:
                 self._wait(stamp_ns, step)
         except RuntimeError as error:
             self._restart(stamp_ns, f"GTSAM: {first_line(error)}")
-        oldest_ns = [front.stamp_ns for front in self._fronts] + [ns for ns, _ in self._waiting]
+        oldest_ns = [front.stamp_ns for front in self._fronts[:1]]
+        oldest_ns += [ns for ns, _ in self._waiting[:1]]
         if self._alignment is not None and self._alignment.oldest_ns is not None:
             oldest_ns.append(self._alignment.oldest_ns)
         self._buffer.drop(min([stamp_ns, *oldest_ns]))
@@ -166,12 +164,11 @@ class InertialEstimator:
         end = known.get(stamp_ns) or self._integrate.advance(self._fronts[-1], stamp_ns)
         if end is None:
             return None
-        T, covariance = self._motion(start, end)
-        covariance = se3.transport_covariance(covariance, self._T_camera_imu)
+        T, covariance = _carried_along(*self._motion(start, end), self._T_camera_imu)
         return Edge(
             reference_id=start.stamp_ns,
-            T_reference_frame=se3.normalize(self._T_camera_imu @ T @ self._T_imu_camera),
-            covariance=0.5 * (covariance + covariance.T),
+            T_reference_frame=se3.normalize(T),
+            covariance=covariance,
             kernel="none",
         )
 
@@ -188,9 +185,8 @@ class InertialEstimator:
 
     def _of_imu(self, step: Edge) -> Edge:
         """Return a step of the camera as one of the IMU."""
-        T = self._T_imu_camera @ step.T_reference_frame @ self._T_camera_imu
-        covariance = se3.transport_covariance(step.covariance, self._T_imu_camera)
-        covariance = 0.5 * (covariance + covariance.T)
+        T_imu_camera = se3.invert(self._T_camera_imu)
+        T, covariance = _carried_along(step.T_reference_frame, step.covariance, T_imu_camera)
         return replace(step, T_reference_frame=T, covariance=covariance)
 
     def _restart(self, stamp_ns: int, reason: str) -> None:
@@ -303,10 +299,7 @@ class InertialEstimator:
         """Make a front the newest state, measured by a step from the newest one or not."""
         n, start = self._n + 1, self._fronts[0]
         motion = end.motion
-        if (
-            motion is None
-            or motion.deltaTij() < 1e-9 * (end.stamp_ns - start.stamp_ns) - _ROUNDING_S
-        ):
+        if end.since_ns != start.stamp_ns:  # of the last piece of the way alone
             motion = self._integrate.between(start.stamp_ns, end.stamp_ns, start.bias)
         if motion is None:
             self._restart(end.stamp_ns, "a hole in the IMU")
@@ -370,6 +363,15 @@ class InertialEstimator:
         self._fronts = [front]
         if self._n_kept > _N_STATES and (n >= _N_UNSURE or front.up[1] < _UPRIGHT):
             self._n_kept = _N_STATES
+
+
+def _carried_along(
+    T: FloatArray, covariance: FloatArray, T_other_frame: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the motion, and its covariance, of what is fixed to a frame that moves so."""
+    covariance = se3.transport_covariance(covariance, T_other_frame)
+    T = T_other_frame @ T @ se3.invert(T_other_frame)
+    return T, np.asarray(0.5 * (covariance + covariance.T))
 
 
 # Time over which the IMU is compared with vision, comparisons that the factor rests on, and for how

@@ -13,6 +13,9 @@ from gvo.types import FloatArray, IntArray
 
 _LARGEST_DENSITY = 10.0
 
+HOLE_S = 0.1
+"""Longer without samples, what an IMU measured is lost, seconds."""
+
 GRAVITY = 9.81
 """What every accelerometer at rest measures, m/s^2; on Earth within 0.03."""
 

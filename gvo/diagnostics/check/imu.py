@@ -7,12 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from gvo.backend.imu_alignment import Aligned, Turns, align
-from gvo.backend.imu_buffer import HOLE_S
 from gvo.diagnostics.check.findings import Finding
 from gvo.diagnostics.check.limits import judged, lost, measured, unknown
 from gvo.errors import GvoError
 from gvo.geometry import se3
-from gvo.geometry.imu import GRAVITY, ImuSamples, ImuStream
+from gvo.geometry.imu import GRAVITY, HOLE_S, ImuSamples, ImuStream
 from gvo.types import FloatArray, IntArray
 
 # An axis is saturated where so many samples in a row have its extreme value, and that is so large
@@ -142,14 +141,14 @@ def _check_delay(found: Aligned, given_s: float | None) -> Finding:
 
 
 def _check_rotation(found: Aligned, T_camera_imu: FloatArray | None) -> Finding:
-    turn = se3.log(se3.make_transform(found.R_camera_imu, np.zeros(3)))[:3]
     sigma_deg = np.degrees(found.sigma_turn)
     if T_camera_imu is None:
+        turn = se3.log(se3.make_transform(found.R_camera_imu, np.zeros(3)))[:3]
         x, y, z = np.degrees(turn)
         text = f"rotation vector ({x:.1f}, {y:.1f}, {z:.1f}) deg, sigma {sigma_deg:.1f}: learnt"
         return Finding(name="imu: rotation", value=text)
     off = found.R_camera_imu.T @ T_camera_imu[:3, :3]
-    off_deg = np.degrees(float(se3.rotation_angle(se3.make_transform(off, np.zeros(3)))))
+    off_deg = np.degrees(float(se3.rotation_angle(off)))
     limit_deg = np.degrees(max(_N_SIGMAS * found.sigma_turn, _MIN_TURN))
     is_wrong = off_deg > limit_deg
     return Finding(

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from gvo.diagnostics.check.findings import Finding, Verdict, number_text
+from gvo.geometry.imu import HOLE_S
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,7 +169,7 @@ RULES: Mapping[str, Rule] = {
     # Below, an IMU tells little of what happens between its samples; 200 Hz are customary.
     "rate": Rule(low=90.0, fault_low=20.0, unit="Hz", fix="let the IMU send at 200 Hz"),
     # What was measured in a longer gap is lost, and the IMU begins anew.
-    "imu gaps": Rule(high=0.1, unit="s", fix="samples were lost: record with a larger queue"),
+    "imu gaps": Rule(high=HOLE_S, unit="s", fix="samples were lost: record with a larger queue"),
     "images without imu": Rule(
         high=0.05,
         fault_high=0.9,

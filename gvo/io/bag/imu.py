@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from gvo.errors import RecordingError
-from gvo.geometry.imu import ImuSamples
+from gvo.geometry.imu import HOLE_S, ImuSamples
 from gvo.io.bag.messages import bare
 from gvo.io.bag.reader import BagMessage, MessageReader
 from gvo.io.bag.topics import IMU_TYPE, Topic, asked_topic, find_topic, n_common_parts
@@ -25,7 +25,7 @@ _GYRO, _ACCELERATION = "angular_velocity", "linear_acceleration"
 # Messages by which is told what a topic measures, and that are read at once.
 _N_FIRST, _N_AT_ONCE = 50, 300
 # Between accelerations that are farther apart none is made up, nanoseconds.
-_HOLE_NS = 100_000_000
+_HOLE_NS = round(1e9 * HOLE_S)
 # Of a gyro that wait for accelerations.
 _N_PENDING = 5_000
 # By how much the clocks of IMU and camera may differ, and how much earlier than the first of a

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal, get_args
 
 import numpy as np
@@ -20,6 +20,14 @@ _STEP_S = 1e-3
 _BESIDE_S = 0.1
 _N_AT_ONCE = 200
 _T_CAMERA_IMU: Final = se3.exp(np.array([1.2, -1.1, 1.3, 0.06, -0.02, 0.05]))
+_ADIS16448: Final = Imu(
+    T_camera_imu=_T_CAMERA_IMU,
+    delay_s=0.0,
+    gyro_noise=1.6968e-4,
+    gyro_walk=1.9393e-5,
+    acceleration_noise=2e-3,
+    acceleration_walk=3e-3,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -128,24 +136,10 @@ def rendered_imu(kind: ImuKind = "adis16448") -> RenderedImu:
     """
     if kind not in get_args(ImuKind):
         raise ValueError(f"kind must be one of {get_args(ImuKind)}, got {kind!r}")
-    place = _T_CAMERA_IMU
     if kind == "adis16448":
-        known = Imu(
-            T_camera_imu=place,
-            delay_s=0.0,
-            gyro_noise=1.6968e-4,
-            gyro_walk=1.9393e-5,
-            acceleration_noise=2e-3,
-            acceleration_walk=3e-3,
-        )
-        return RenderedImu(imu=known)
-    known = Imu(
-        T_camera_imu=place,
-        delay_s=0.0,
-        gyro_noise=1e-3,
-        gyro_walk=1e-4,
-        acceleration_noise=1e-2,
-        acceleration_walk=5e-3,
+        return RenderedImu(imu=_ADIS16448)
+    known = replace(
+        _ADIS16448, gyro_noise=1e-3, gyro_walk=1e-4, acceleration_noise=1e-2, acceleration_walk=5e-3
     )
     return RenderedImu(
         imu=known,
