@@ -56,12 +56,10 @@ class ImuBuffer:
         if 2 * n > len(self):  # not with each frame: the rest is copied
             self._stamps_ns, self._values = self._stamps_ns[n:], self._values[n:]
 
-    def between(
-        self, start_ns: int, end_ns: int
-    ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """Return an interval in pieces: seconds (n,), mean rates and accelerations (n, 3).
+    def between(self, start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray] | None:
+        """Return an interval in pieces: seconds (n,), mean rates and accelerations (n, 6).
 
-        Both are linear between samples. None if a hole is in the interval.
+        They are linear between samples. None if a hole is in the interval.
         """
         start, end = start_ns - self.delay_ns, end_ns - self.delay_ns
         first = int(np.searchsorted(self._stamps_ns, start, "right"))
@@ -71,8 +69,7 @@ class ImuBuffer:
         knots_ns = np.concatenate([[start], self._stamps_ns[first:last], [end]])
         ends = self._at(start, first), self._at(end, last)
         values = np.vstack([ends[0], self._values[first:last], ends[1]])
-        means = 0.5 * (values[1:] + values[:-1])
-        return 1e-9 * np.diff(knots_ns), means[:, :3], means[:, 3:]
+        return 1e-9 * np.diff(knots_ns), 0.5 * (values[1:] + values[:-1])
 
     def mean_rate(self, start_ns: int, end_ns: int) -> FloatArray | None:
         """Return the mean of the rates (3,) measured in an interval; None if none was."""

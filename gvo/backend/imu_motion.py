@@ -3,29 +3,28 @@
 References
 ----------
 C. Forster, L. Carlone, F. Dellaert, D. Scaramuzza, "On-manifold preintegration for real-time
-visual-inertial odometry", IEEE T-RO 33(1), 2017, doi:10.1109/TRO.2016.2597321.
+visual-inertial odometry", IEEE T-RO 33(1), 2017, doi:10.1109/TRO.2016.2597321; Z. Huai, G. Huang,
+"Robocentric visual-inertial odometry", IJRR 41(7), 2022, doi:10.1177/0278364919853361 (states in
+axes that move along).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import NamedTuple
 
-import gtsam
 import numpy as np
 
 from gvo.backend.imu_buffer import ImuBuffer
 from gvo.geometry import se3
-from gvo.geometry.imu import Imu
-from gvo.types import FloatArray
-
-Motion: TypeAlias = gtsam.PreintegratedCombinedMeasurements
-Bias: TypeAlias = gtsam.imuBias.ConstantBias
+from gvo.geometry.imu import GRAVITY, Imu
+from gvo.kernels.inertial import preintegrate
+from gvo.types import Edge, FloatArray
 
 # Data sheets speak of an IMU that lies still: in use its noise is so many times larger.
 _INFLATION = 3.0
 # Longer intervals are linearized in pieces, nanoseconds.
-_LONGEST_NS = 200_000_000
+_LONGEST_NS = 100_000_000
 # The angular velocity at a frame is the mean over so long around it, nanoseconds.
 _NOW_NS = 5_000_000
 # What the IMU feels at rest, beside so many sigmas of its noise: m/s^2 and rad/s.
@@ -38,52 +37,86 @@ _LEAST_SHARE = 1e-4
 class Front:
     """Where the IMU is at a frame, by what is known at the newest measured one.
 
-    `motion` is what the IMU measured since `since_ns`. `covariance` (17, 17) is that of (rotation
-    in its own axes, position, velocity, biases of acceleration and gyro, gravity along
-    `gravity_axes`), as seen from the newest measured one.
+    Parameters
+    ----------
+    stamp_ns : int
+    T_world_imu : ndarray of float64, shape (4, 4)
+        In its axes at the newest measured frame.
+    velocity : ndarray of float64, shape (3,)
+        In its own axes, m/s, as is what follows.
+    biases : ndarray of float64, shape (6,)
+        Of gyro and accelerometer, rad/s and m/s^2.
+    gravity : ndarray of float64, shape (3,)
+        m/s^2, downwards.
+    covariance : ndarray of float64, shape (18, 18)
+        Of the pose (right perturbation), and of the rest in this order.
+    is_resting : bool
+        The velocity is zero, as long as the IMU feels nothing but gravity.
+    is_still : bool
+        It felt nothing else on the last piece of the way.
     """
 
     stamp_ns: int
-    navigation: gtsam.NavState
-    covariance: FloatArray
-    bias: Bias
+    T_world_imu: FloatArray
+    velocity: FloatArray
+    biases: FloatArray
     gravity: FloatArray
-    gravity_axes: FloatArray
-    motion: Motion | None = None
-    since_ns: int = 0
+    covariance: FloatArray
     is_resting: bool = False
-
-    @property
-    def R_world_imu(self) -> FloatArray:  # noqa: N802 - the field's name
-        """Rotation (3, 3)."""
-        return np.asarray(self.navigation.attitude().matrix())
-
-    @property
-    def T_world_imu(self) -> FloatArray:  # noqa: N802 - the field's name
-        """Pose (4, 4)."""
-        return np.asarray(self.navigation.pose().matrix())
+    is_still: bool = False
 
     @property
     def up(self) -> tuple[FloatArray, float]:
-        """The unit vector (3,) against gravity in the axes of the IMU, and its sigma, rad."""
-        R, length = self.R_world_imu.T, float(np.linalg.norm(self.gravity))
-        up = -R @ self.gravity / length
-        J = np.zeros((3, 17))
-        J[:, :3], J[:, 15:] = se3.skew(up), -R @ self.gravity_axes / length
-        return up, float(np.sqrt((J @ self.covariance @ J.T).diagonal().max()))
+        """The unit vector (3,) against gravity, and its sigma, rad."""
+        up = -self.gravity / np.linalg.norm(self.gravity)
+        J = se3.skew(up) / np.linalg.norm(self.gravity)
+        return up, float(np.sqrt((J @ self.covariance[15:, 15:] @ J.T).diagonal().max()))
 
     @property
     def speed(self) -> tuple[float, float]:
         """The length of the velocity, m/s, and the sigma of its least certain axis."""
-        length = float(np.linalg.norm(self.navigation.velocity()))
-        return length, float(np.sqrt(self.covariance.diagonal()[6:9].max()))
+        sigma = float(np.sqrt(self.covariance.diagonal()[6:9].max()))
+        return float(np.linalg.norm(self.velocity)), sigma
 
-    @property
-    def pose_covariance(self) -> FloatArray:
-        """Covariance (6, 6) of the pose, right perturbation."""
-        J = np.eye(6)
-        J[3:, 3:] = self.R_world_imu.T
-        return np.asarray(J @ self.covariance[:6, :6] @ J.T)
+    def measured(self, step: Edge | None) -> Front:
+        """Return the front as the newest measured one: exact, as all is seen from there.
+
+        By a step from the one before, a Kalman filter corrects the rest; without, it stays.
+        """
+        x, P = np.zeros(18), self.covariance
+        if step is not None:
+            K = np.linalg.solve(P[:6, :6] + step.covariance, P[:6]).T
+            x = K @ se3.log(se3.invert(self.T_world_imu) @ step.T_reference_frame)
+            kept = np.eye(18)
+            kept[:, :6] -= K
+            P = kept @ P @ kept.T + K @ step.covariance @ K.T
+        gravity, covariance = self.gravity + x[15:], np.zeros((18, 18))
+        covariance[6:, 6:] = P[6:, 6:]
+        return replace(
+            self,
+            T_world_imu=np.eye(4),
+            velocity=self.velocity + x[6:9],
+            biases=self.biases + x[9:15],
+            gravity=GRAVITY * gravity / np.linalg.norm(gravity),
+            covariance=covariance,
+        )
+
+
+class Motion(NamedTuple):
+    """What was measured during an interval, without gravity.
+
+    Parameters
+    ----------
+    length_s : float
+    T : ndarray of float64, shape (4, 4)
+        Where the IMU is at its end, in the axes at its start, if it had stood there.
+    velocity : ndarray of float64, shape (3,)
+        How much faster it is then, in the axes at its start, m/s.
+    """
+
+    length_s: float
+    T: FloatArray
+    velocity: FloatArray
 
 
 class Preintegrator:
@@ -91,30 +124,19 @@ class Preintegrator:
 
     def __init__(self, imu: Imu, buffer: ImuBuffer) -> None:
         self._buffer, self._imu = buffer, imu
-        # Gravity is added where it is known.
-        self._parameters = gtsam.PreintegrationCombinedParams.MakeSharedU(0.0)
-        unit = np.eye(3)
-        self._parameters.setGyroscopeCovariance((_INFLATION * imu.gyro_noise) ** 2 * unit)
-        noise = _INFLATION * imu.acceleration_noise
-        self._parameters.setAccelerometerCovariance(noise**2 * unit)
-        self._parameters.setBiasOmegaCovariance(imu.gyro_walk**2 * unit)
-        self._parameters.setBiasAccCovariance(imu.acceleration_walk**2 * unit)
-        self._parameters.setIntegrationCovariance(1e-8 * unit)
+        noise = _INFLATION * np.array([imu.gyro_noise, imu.acceleration_noise])
+        self._variances = np.repeat(noise**2, 3)
+        self._walks = np.repeat([imu.gyro_walk**2, imu.acceleration_walk**2], 3)
 
-    def between(self, start_ns: int, end_ns: int, bias: Bias) -> Motion | None:
+    def between(self, start_ns: int, end_ns: int, biases: FloatArray) -> Motion | None:
         """Return what was measured between two stamps; None if a hole is in it."""
         pieces = self._buffer.between(start_ns, end_ns)
         if pieces is None:
             return None
-        durations_s, rates, accelerations = pieces
-        # GTSAM turns an acceleration as at the start of its interval: it is meant in the middle.
-        halves = 0.5 * durations_s[:, np.newaxis] * (rates - bias.gyroscope())
-        turned = (se3.skew(halves) @ accelerations[..., np.newaxis])[..., 0]
-        accelerations = accelerations + turned
-        motion = Motion(self._parameters, bias)
-        for acceleration, rate, duration_s in zip(accelerations, rates, durations_s, strict=True):
-            motion.integrateMeasurement(acceleration, rate, duration_s)
-        return motion
+        durations_s, values = pieces
+        T, velocity = np.eye(4), np.zeros(3)
+        preintegrate(durations_s, values - biases, T, velocity)
+        return Motion(1e-9 * (end_ns - start_ns), T, velocity)
 
     def twist(self, front: Front) -> tuple[FloatArray, FloatArray] | None:
         """Return angular velocity and velocity (6,) at a front in the axes of the IMU.
@@ -124,93 +146,73 @@ class Preintegrator:
         rate = self._buffer.mean_rate(front.stamp_ns - _NOW_NS // 2, front.stamp_ns + _NOW_NS // 2)
         if rate is None:
             return None
-        R, J = front.R_world_imu.T, np.zeros((6, 17))
-        velocity = R @ front.navigation.velocity()
-        J[:3, 12:15], J[3:, :3], J[3:, 6:9] = -np.eye(3), se3.skew(velocity), R
-        covariance = J @ front.covariance @ J.T
-        covariance[:3, :3] += 1e9 / _NOW_NS * self._parameters.getGyroscopeCovariance()
-        return np.concatenate([rate - front.bias.gyroscope(), velocity]), covariance
+        order = [9, 10, 11, 6, 7, 8]
+        covariance = front.covariance[np.ix_(order, order)]
+        covariance[:3, 3:] *= -1.0  # a rate is what the bias leaves
+        covariance[3:, :3] *= -1.0
+        covariance[:3, :3] += 1e9 / _NOW_NS * np.diag(self._variances[:3])
+        return np.concatenate([rate - front.biases[:3], front.velocity]), covariance
 
     def advance(self, front: Front, stamp_ns: int) -> Front | None:
         """Return the front at a later stamp; None if a hole comes before it."""
         start_ns, length_ns = front.stamp_ns, stamp_ns - front.stamp_ns
         n_steps = max(-(-length_ns // _LONGEST_NS), 1)
         for each_ns in [start_ns + k * length_ns // n_steps for k in range(1, n_steps + 1)]:
-            motion = self.between(front.stamp_ns, each_ns, front.bias)
+            motion = self.between(front.stamp_ns, each_ns, front.biases)
             if motion is None:
                 return None
-            is_resting = front.is_resting and self.is_still(front, motion)
-            front = _moved(front, each_ns, motion, is_resting=is_resting)
+            front = self._moved(front, each_ns, motion)
         return front
 
-    def is_still(self, front: Front, motion: Motion) -> bool:
-        """Tell whether the IMU felt nothing but gravity."""
-        t, imu = motion.deltaTij(), self._imu
-        acceleration = front.R_world_imu @ motion.deltaVij() / t + front.gravity
-        turn, n_sigmas = se3.rotation_angle(rotation_of(motion)) / t, _STILL_SIGMAS / np.sqrt(t)
+    def _moved(self, front: Front, stamp_ns: int, motion: Motion) -> Front:
+        """Return a front moved on by what the IMU measured."""
+        is_still = self._is_still(front, motion)
+        is_resting = front.is_resting and is_still
+        t, step, velocity = motion.length_s, motion.T.copy(), np.zeros(3)
+        if is_resting:
+            step[:3, 3] = 0.0
+        else:
+            step[:3, 3] += t * front.velocity + 0.5 * t * t * front.gravity
+            velocity = front.velocity + t * front.gravity + motion.velocity
+        R_end_start = step[:3, :3].T
+        velocity, gravity = R_end_start @ velocity, R_end_start @ front.gravity
+        F = np.eye(18)
+        F[:6, :6] = se3.adjoint(se3.invert(step))
+        F[3:6, 6:9], F[6:9, 6:9], F[15:, 15:] = t * R_end_start, R_end_start, R_end_start
+        # What the gyro and the accelerometer measure too much; axes of their own turn along.
+        J = np.zeros((18, 6))
+        turns = J[:, :3]
+        turns[:3], turns[6:9], turns[15:] = np.eye(3), se3.skew(velocity), se3.skew(gravity)
+        turns *= -t
+        if not is_resting:
+            F[3:6, 15:], F[6:9, 15:] = 0.5 * t * t * R_end_start, t * R_end_start
+            # In a short interval both hardly change.
+            turned = R_end_start @ se3.skew(motion.velocity)
+            halfway = 0.5 * (R_end_start + np.eye(3))
+            turns[3:6] += t * t / 6.0 * turned
+            turns[6:9] += 0.5 * t * turned
+            J[3:6, 3:], J[6:9, 3:] = -0.5 * t * t * halfway, -t * halfway
+        F[:, 9:15] += J
+        Q = (J * self._variances / t) @ J.T
+        Q[range(9, 15), range(9, 15)] += t * self._walks
+        return replace(
+            front,
+            stamp_ns=stamp_ns,
+            T_world_imu=front.T_world_imu @ step,
+            velocity=velocity,
+            gravity=gravity,
+            covariance=F @ front.covariance @ F.T + Q,
+            is_resting=is_resting,
+            is_still=is_still,
+        )
+
+    def _is_still(self, front: Front, motion: Motion) -> bool:
+        """Tell whether the IMU felt nothing but gravity after a front."""
+        t, imu = motion.length_s, self._imu
+        turn, n_sigmas = se3.rotation_angle(motion.T) / t, _STILL_SIGMAS / np.sqrt(t)
         most = _STILL_ACCELERATION + n_sigmas * imu.acceleration_noise
-        is_still = np.linalg.norm(acceleration) < most
+        is_still = np.linalg.norm(motion.velocity / t + front.gravity) < most
         return bool(is_still and turn < _STILL_TURN + n_sigmas * imu.gyro_noise)
-
-
-def _moved(front: Front, stamp_ns: int, motion: Motion, *, is_resting: bool) -> Front:
-    """Return a front moved on by what the IMU measured (Forster 2017, section VI)."""
-    t, g = motion.deltaTij(), front.gravity
-    predicted = motion.predict(front.navigation, front.bias)
-    F, Q = _linearize(front, motion)
-    if is_resting:
-        F[3:9, :3] = F[3:9, 9:] = 0.0
-        Q[3:9] = Q[:, 3:9] = 0.0
-        position, velocity = front.navigation.position(), np.zeros(3)
-    else:
-        position = predicted.position() + 0.5 * t * t * g
-        velocity = predicted.velocity() + t * g
-    return replace(
-        front,
-        stamp_ns=stamp_ns,
-        navigation=gtsam.NavState(gtsam.Pose3(predicted.attitude(), position), velocity),
-        covariance=F @ front.covariance @ F.T + Q,
-        motion=motion,
-        since_ns=front.stamp_ns,
-        is_resting=is_resting,
-    )
-
-
-def rotation_of(motion: Motion) -> FloatArray:
-    """Return the rotation (3, 3) of a motion."""
-    return np.asarray(motion.deltaRij().matrix())
-
-
-def _linearize(front: Front, motion: Motion) -> tuple[FloatArray, FloatArray]:
-    """Return how errors before an interval act after it, and the covariance it adds, (17, 17)."""
-    t, R = motion.deltaTij(), front.R_world_imu
-    F, axes = np.eye(17), np.eye(17)
-    axes[3:6, 3:6] = axes[6:9, 6:9] = R
-    axes[9:15, 9:15] = -np.eye(6)  # GTSAM counts biases by how much they fall
-    F[:3, :3] = rotation_of(motion).T
-    F[3:6, :3] = -R @ se3.skew(motion.deltaPij())
-    F[6:9, :3] = -R @ se3.skew(motion.deltaVij())
-    F[3:6, 6:9] = t * np.eye(3)
-    F[3:6, 15:] = 0.5 * t * t * front.gravity_axes
-    F[6:9, 15:] = t * front.gravity_axes
-    F[:9, 9:15] = axes[:9, :9] @ _bias_effects(motion)
-    Q = np.zeros((17, 17))
-    Q[:15, :15] = motion.preintMeasCov()
-    return F, axes @ Q @ axes.T
-
-
-def _bias_effects(motion: Motion) -> FloatArray:
-    """Return derivatives (9, 6) of rotation (right), position and velocity by both biases.
-
-    Of a short interval, during which acceleration and rate hardly change.
-    """
-    t, effects = motion.deltaTij(), np.zeros((9, 6))
-    halfway = 0.5 * (np.eye(3) + rotation_of(motion))
-    turned = se3.skew(motion.deltaVij() / t)
-    effects[:3, 3:] = -t * np.eye(3)
-    effects[3:6, :3], effects[3:6, 3:] = -0.5 * t**2 * halfway, t**3 / 6.0 * turned
-    effects[6:, :3], effects[6:, 3:] = -t * halfway, 0.5 * t**2 * turned
-    return effects
 
 
 def step_covariance(before: FloatArray, T_step: FloatArray, after: FloatArray) -> FloatArray:

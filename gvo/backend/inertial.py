@@ -4,31 +4,21 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from typing import Final
 
-import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
 
-from gvo.backend.factors import first_line
 from gvo.backend.imu_alignment import Alignment
 from gvo.backend.imu_buffer import ImuBuffer
-from gvo.backend.imu_motion import Bias, Front, Preintegrator, step_covariance
-from gvo.backend.imu_start import Start, find_start
+from gvo.backend.imu_motion import Front, Preintegrator, step_covariance
+from gvo.backend.imu_start import find_start
 from gvo.geometry import se3
-from gvo.geometry.imu import GRAVITY, Imu, ImuSamples
+from gvo.geometry.imu import Imu, ImuSamples
 from gvo.types import Edge, Failure, FloatArray, InertialState
 
 _LOGGER = logging.getLogger(__name__)
 
-_G: Final = gtsam.symbol("g", 0)
-# States of so many measured frames are estimated together. All up to so many, while the direction
-# of gravity is less sure than this, rad: what leaves fixes where it is linearized.
-_N_STATES, _N_UNSURE, _UPRIGHT = 3, 20, 0.01
 # Registered frames that it starts from.
 _N_START = 15
-# Of the first state: sigmas of velocity (m/s), direction of gravity (rad), biases (m/s^2, rad/s).
-_VELOCITY, _TILT, _ACCELERATION_BIAS, _GYRO_BIAS = 1.0, 0.1, 0.3, 0.05
 # A step contradicts the IMU from so many sigmas on, per degree of freedom; after so many in a row
 # it is the IMU that is wrong.
 _GATE, _N_CONTRADICTIONS = 5.0, 6
@@ -39,9 +29,10 @@ _REST_SPEED, _REST_SIGMAS = 0.02, 3.0
 class InertialEstimator:
     """Estimates velocity, gravity and biases from visual steps and an IMU; predicts motions.
 
-    States are poses of the IMU in a world of their own, which begins at the first of them. Nothing
-    here acts on the window but what `carry` returns. It begins anew where the IMU has a hole,
-    where steps contradict it one after the other, and where GTSAM fails.
+    A Kalman filter, whose state is told in the axes of the IMU at the newest measured frame: only
+    motions are measured, and only motions are asked for. Nothing here acts on the window but what
+    `carry` returns. It begins anew where the IMU has a hole, and where steps contradict it one
+    after the other.
 
     Parameters
     ----------
@@ -90,9 +81,6 @@ class InertialEstimator:
         self._waiting: list[tuple[int, Edge | None]] = []
         # Afterwards: where the newest measured frame is, and those after it.
         self._fronts: list[Front] = []
-        self._isam = gtsam.ISAM2()
-        self._alive: list[int] = []
-        self._n = self._oldest = self._n_kept = 0
         self._audit.begin(None)
 
     @property
@@ -106,15 +94,15 @@ class InertialEstimator:
             return None
         twist, covariance = found
         up, sigma = front.up
-        acceleration, gyro = front.covariance.diagonal()[9:15].reshape(2, 3).max(axis=1)
+        biases = np.sqrt(front.covariance.diagonal()[9:15].reshape(2, 3).max(axis=1))
         return InertialState(
             stamp_ns=front.stamp_ns,
             twist=se3.adjoint(T) @ twist,
             twist_covariance=se3.transport_covariance(covariance, T),
             up=T[:3, :3] @ up,
-            gyro_bias=front.bias.gyroscope(),
-            acceleration_bias=front.bias.accelerometer(),
-            sigmas=np.array([sigma, np.sqrt(gyro), np.sqrt(acceleration)]),
+            gyro_bias=front.biases[:3],
+            acceleration_bias=front.biases[3:],
+            sigmas=np.array([sigma, *biases]),
         )
 
     def add(self, samples: ImuSamples) -> None:
@@ -137,14 +125,12 @@ class InertialEstimator:
                 self._buffer.drop(stamp_ns)
             return
         step = None if step is None else self._of_imu(step)
-        try:
-            if self._fronts:
-                self._go_on(stamp_ns, step)
-            else:
-                self._wait(stamp_ns, step)
-        except RuntimeError as error:
-            self._restart(stamp_ns, f"GTSAM: {first_line(error)}")
-        oldest_ns = [front.stamp_ns for front in self._fronts[:1]]
+        if self._fronts:
+            self._go_on(stamp_ns, step)
+        else:
+            self._wait(stamp_ns, step)
+        oldest = [*self._fronts[:1], self._audit.start]
+        oldest_ns = [front.stamp_ns for front in oldest if front is not None]
         oldest_ns += [ns for ns, _ in self._waiting[:1]]
         if self._alignment is not None and self._alignment.oldest_ns is not None:
             oldest_ns.append(self._alignment.oldest_ns)
@@ -178,9 +164,9 @@ class InertialEstimator:
     def _motion(self, start: Front, end: Front) -> tuple[FloatArray, FloatArray]:
         """Return the pose of the IMU at a front in that at another, and its covariance."""
         T = se3.invert(start.T_world_imu) @ end.T_world_imu
-        covariance = end.pose_covariance
+        covariance = end.covariance[:6, :6]
         if start is not self._fronts[0]:
-            covariance = step_covariance(start.pose_covariance, T, covariance)
+            covariance = step_covariance(start.covariance[:6, :6], T, covariance)
         return T, self._audit.factor * covariance
 
     def _of_imu(self, step: Edge) -> Edge:
@@ -230,37 +216,10 @@ class InertialEstimator:
             self._waiting = self._waiting[_N_START // 2 :]
             return
         self._waiting = []
-        self._put_first(stamps_ns[0], found)
+        self._fronts = [found]
         for stamp_ns, step in zip(stamps_ns[1:], steps, strict=True):
             if self._fronts:
                 self._go_on(stamp_ns, step)
-
-    def _put_first(self, stamp_ns: int, start: Start) -> None:
-        """Put the first state into a new graph."""
-        direction = gtsam.Unit3(start.gravity / np.linalg.norm(start.gravity))
-        bias, values = Bias(np.zeros(3), start.gyro_bias), gtsam.Values()
-        values.insert(X(0), gtsam.Pose3())
-        values.insert(V(0), start.velocity)
-        values.insert(B(0), bias)
-        values.insert(_G, direction)
-        of_biases = np.repeat([_ACCELERATION_BIAS, _GYRO_BIAS], 3)
-        sigmas = [np.full(6, 1e-5), np.full(3, _VELOCITY), of_biases, np.full(2, _TILT)]
-        exact, of_velocity, of_bias, tilt = map(gtsam.noiseModel.Diagonal.Sigmas, sigmas)
-        graph = gtsam.NonlinearFactorGraph()
-        graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), exact))
-        graph.add(gtsam.PriorFactorVector(V(0), start.velocity, of_velocity))
-        graph.add(gtsam.PriorFactorConstantBias(B(0), bias, of_bias))
-        graph.add(gtsam.PriorFactorUnit3(_G, direction, tilt))
-        parameters = gtsam.ISAM2Params()
-        parameters.setFactorization("QR")  # Cholesky fails sooner or later
-        parameters.setRelinearizeThreshold(0.01)
-        parameters.relinearizeSkip = 1
-        parameters.findUnusedFactorSlots = True
-        self._isam = gtsam.ISAM2(parameters)
-        self._isam.update(graph, values)
-        self._alive, self._n, self._oldest = [_G, X(0), V(0), B(0)], 0, 0
-        self._n_kept = _N_UNSURE
-        self._read(stamp_ns)
 
     # Afterwards
 
@@ -282,10 +241,13 @@ class InertialEstimator:
             return
         self._n_contradictions = 0
         if start is not self._fronts[0]:
-            self._add(start, None)
+            self._fronts = [start.measured(None)]
             end = self._integrate.advance(self._fronts[0], stamp_ns)
         if end is not None:
-            self._add(end, step)
+            front = end.measured(step)
+            speed, sigma = front.speed
+            is_slow = speed < max(_REST_SPEED, _REST_SIGMAS * sigma)
+            self._fronts = [replace(front, is_resting=is_slow and front.is_still)]
             self._audit.follow(self._fronts[0], step, self._integrate)
 
     def _is_contradicted(self, start: Front, end: Front, step: Edge) -> bool:
@@ -294,75 +256,6 @@ class InertialEstimator:
         difference = se3.log(se3.invert(T) @ step.T_reference_frame)
         squares = se3.mahalanobis(difference, covariance + step.covariance)
         return bool(squares > 6.0 * _GATE**2)
-
-    def _add(self, end: Front, step: Edge | None) -> None:
-        """Make a front the newest state, measured by a step from the newest one or not."""
-        n, start = self._n + 1, self._fronts[0]
-        motion = end.motion
-        if end.since_ns != start.stamp_ns:  # of the last piece of the way alone
-            motion = self._integrate.between(start.stamp_ns, end.stamp_ns, start.bias)
-        if motion is None:
-            self._restart(end.stamp_ns, "a hole in the IMU")
-            return
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        keys = X(n - 1), V(n - 1), X(n), V(n), B(n - 1), B(n), _G
-        graph.add(gtsam.CombinedImuFactorWithGravityDirection(*keys, motion, GRAVITY))
-        if step is not None:
-            noise = gtsam.noiseModel.Gaussian.Covariance(step.covariance)
-            T = gtsam.Pose3(step.T_reference_frame)
-            graph.add(gtsam.BetweenFactorPose3(X(n - 1), X(n), T, noise))
-        values.insert(X(n), end.navigation.pose())
-        values.insert(V(n), end.navigation.velocity())
-        values.insert(B(n), start.bias)
-        self._update(graph, values, n)
-        self._read(end.stamp_ns)
-        speed, sigma = self._fronts[0].speed
-        if speed < max(_REST_SPEED, _REST_SIGMAS * sigma):
-            is_resting = self._integrate.is_still(start, motion)
-            self._fronts[0] = replace(self._fronts[0], is_resting=is_resting)
-
-    def _update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, n: int) -> None:
-        """Smooth the states, and let old ones leave."""
-        new, end = [X(n), V(n), B(n)], min(self._oldest + 2, n - self._n_kept + 1)
-        leaving = [key(k) for k in range(self._oldest, end) for key in (V, B, X)]
-        constrained, reeliminated = gtsam.KeyGroupMap(), gtsam.KeyList()
-        for key in (*self._alive, *new):  # what leaves must be leaves of the tree: each in a group
-            group = leaving.index(key) if key in leaving else len(leaving)
-            constrained.insert2(key, group)
-        for key in self._alive:
-            reeliminated.push_back(key)
-        self._isam.update(graph, values, [], constrained, None, reeliminated, False)
-        for key in leaving:
-            leaf = gtsam.KeyList()
-            leaf.push_back(key)
-            self._isam.marginalizeLeaves(leaf)
-        self._alive = [key for key in self._alive if key not in leaving] + new
-        self._n, self._oldest = n, max(end, self._oldest)
-
-    def _read(self, stamp_ns: int) -> None:
-        """Read the newest state, which predictions start from."""
-        n, isam = self._n, self._isam
-        velocity = np.asarray(isam.calculateEstimateVector(V(n)))
-        gravity = isam.calculateEstimate().atUnit3(_G)
-        axes, down = GRAVITY * np.asarray(gravity.basis()), GRAVITY * np.asarray(gravity.point3())
-        T_world_imu, covariance = isam.calculateEstimatePose3(X(n)), np.zeros((17, 17))
-        # Seen from the pose: where the way began is forgotten, and its turn turns the rest along.
-        seen, R = np.eye(17)[6:], T_world_imu.rotation().matrix()
-        seen[:3, :3] = se3.skew(velocity) @ R
-        seen[9:, :3] = axes.T @ se3.skew(down) @ R / GRAVITY**2
-        joint = isam.jointMarginalCovariance([X(n), V(n), B(n), _G]).fullMatrix()
-        covariance[6:, 6:] = seen @ joint @ seen.T
-        front = Front(
-            stamp_ns=stamp_ns,
-            navigation=gtsam.NavState(T_world_imu, velocity),
-            covariance=covariance,
-            bias=isam.calculateEstimateConstantBias(B(n)),
-            gravity=down,
-            gravity_axes=axes,
-        )
-        self._fronts = [front]
-        if self._n_kept > _N_STATES and (n >= _N_UNSURE or front.up[1] < _UPRIGHT):
-            self._n_kept = _N_STATES
 
 
 def _carried_along(
@@ -393,17 +286,17 @@ class _Audit:
     def __init__(self) -> None:
         self.factor = 1.0
         self._sum = self._weight = _PRESUMED
-        self._start: Front | None = None
+        self.start: Front | None = None
         self._end_ns = 0
 
     def begin(self, front: Front | None) -> None:
         """Begin to compare from a front on."""
-        self._start, self._T_start_end = front, np.eye(4)
+        self.start, self._T_start_end = front, np.eye(4)
         self._end_ns = 0 if front is None else front.stamp_ns
 
     def follow(self, front: Front, step: Edge, integrate: Preintegrator) -> None:
         """Take the step to the newest state."""
-        start = self._start
+        start = self.start
         if start is None or step.reference_id != self._end_ns:
             self.begin(front)
             return
@@ -412,17 +305,16 @@ class _Audit:
             predicted = integrate.advance(start, front.stamp_ns)
             if predicted is not None:
                 # Steps lead between poses that do not drift apart: both ends are wrong by one.
-                self._judge(start, predicted, 2.0 * step.covariance)
+                self._judge(predicted, 2.0 * step.covariance)
             self.begin(front)
 
-    def _judge(self, start: Front, predicted: Front, seen: FloatArray) -> None:
+    def _judge(self, predicted: Front, seen: FloatArray) -> None:
         """Find the factor f of C so that differences have the covariance f C + that of vision.
 
         Along the axes that both have in common: weighed by how much vision tells there.
         """
-        T = se3.invert(start.T_world_imu) @ predicted.T_world_imu
-        difference = se3.log(se3.invert(T) @ self._T_start_end)
-        L_inverse = np.linalg.inv(np.linalg.cholesky(predicted.pose_covariance))
+        difference = se3.log(se3.invert(predicted.T_world_imu) @ self._T_start_end)
+        L_inverse = np.linalg.inv(np.linalg.cholesky(predicted.covariance[:6, :6]))
         ratios, axes = np.linalg.eigh(L_inverse @ seen @ L_inverse.T)
         squares = (axes.T @ L_inverse @ difference) ** 2
         weights = 1.0 / (1.0 + ratios) ** 2

@@ -40,7 +40,7 @@ def cut(buffer: ImuBuffer, start_ns: int, end_ns: int) -> tuple[FloatArray, Floa
     """Return the lengths of the pieces of an interval, seconds, and their values (n, 6)."""
     pieces = buffer.between(start_ns, end_ns)
     assert pieces is not None
-    return pieces[0], np.hstack(pieces[1:])
+    return pieces
 
 
 @given(gaps_ns, shares)

@@ -98,6 +98,20 @@ def test_it_is_wrong_by_as_much_as_it_says(sigmas: tuple[float, float]) -> None:
     assert np.median(found) < 2.0
 
 
+@pytest.mark.parametrize("factor", [1.0, 10.0])
+def test_how_much_noisier_it_is_than_it_says_is_learnt(factor: float) -> None:
+    found = []
+    for seed in range(10):
+        true = {name: factor * density for name, density in ADIS16448.items()}
+        known = replace(EXACT, T_camera_imu=np.eye(4), **ADIS16448)
+        sensor = Sensor(densities=true, seed=seed)
+        ride = Ride(estimator(known), sensor=sensor, sigmas=SEEN, seed=seed)
+        edge = ride.ride(12.0).carry(1.0)
+        assert edge is not None
+        found.append(nees(edge, ride.true_step(12.0, 13.0)))
+    assert 0.2 < np.mean(found) < 3.0
+
+
 def true_twist(time_s: float, ride: Ride) -> FloatArray:
     """Return how the camera turns and moves, in its own axes."""
     T_imu_camera = np.linalg.inv(ride.hand.imu_pose(time_s)) @ ride.camera_pose(time_s)
