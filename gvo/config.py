@@ -238,6 +238,8 @@ class ImuConfig(Section):
         None,
         "added to its stamps to get those of images; null: as the recording says, else learnt",
         "ms",
+        ge=-60_000,
+        le=60_000,
     )
     gyro_noise: float | None = _expert(
         None,

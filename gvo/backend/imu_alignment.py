@@ -30,7 +30,9 @@ MAX_DELAY_S = 0.1
 _GRID_S, _BEND_S = 0.005, 0.0025
 # Steps are added up over so long, and so many of these sums tell at least.
 _SPAN_NS, _FEWEST = 200_000_000, 8
-# After how many more steps it is tried again, and after how many no more.
+# Slower turns are not compared, rad/s.
+_LEAST_RATE = 0.02
+# After how many more steps it is tried again, and the most that are kept for it.
 _AGAIN, _MOST = 30, 900
 # Steps that differ by more than so many times the median difference are wrong.
 _OUTLIER = 3.0
@@ -38,10 +40,6 @@ _OUTLIER = 3.0
 # other are alike: their number counts for less.
 _SURE_TURN, _SURE_DELAY_S = np.radians(1.0), 0.002
 _ALIKE = 2.0
-# What is known is replaced by what is surer by this factor, and differs by so much: rad and s. It
-# costs a new start.
-_BETTER = 0.5
-_OTHER_TURN, _OTHER_DELAY_S = np.radians(0.3), 0.001
 # Lengths of gyro over visual rates, beyond which one of them is something else.
 _SCALES = 0.8, 1.25
 
@@ -169,10 +167,11 @@ class _Fit:
         spans_s = 1e-9 * (np.stack([seen.start_ns, seen.end_ns], axis=1) - origin_ns)
         last_s = stamps_s[-1] if len(stamps_s) else 0.0
         within = (spans_s[:, 0] > MAX_DELAY_S) & (spans_s[:, 1] < last_s - MAX_DELAY_S)
+        rates = seen.turns / np.diff(spans_s, axis=1)
+        within &= np.linalg.norm(rates, axis=1) > _LEAST_RATE  # rest would decide what is usual
         if np.count_nonzero(within) < _FEWEST:
             return None
-        spans_s = spans_s[within]
-        rates = seen.turns[within] / np.diff(spans_s, axis=1)
+        spans_s, rates = spans_s[within], rates[within]
         angles = np.zeros_like(gyro)
         means = 0.5 * (gyro[1:] + gyro[:-1])
         np.cumsum(means * np.diff(stamps_s)[:, np.newaxis], axis=0, out=angles[1:])
@@ -236,26 +235,21 @@ class Alignment:
     ----------
     steps : list of (int, Edge)
         With the stamps that they lead to, in turn.
-    is_done : bool
-        More frames would hardly tell more.
     """
 
     def __init__(self, imu: Imu) -> None:
         self._imu = imu
-        self._found: Aligned | None = None
         self.steps: list[tuple[int, Edge]] = []
         self._n_new = 0
-        self._unsure = 1.0
-        self.is_done = False
 
     def follow(self, step: Edge | None, stamp_ns: int, buffer: ImuBuffer) -> Imu | None:
-        """Take the next frame and its visual step; return the IMU where it is known better."""
+        """Take the next frame and its visual step; return the IMU once all is known."""
         if step is not None:
             self.steps.append((stamp_ns, step))
             self._n_new += 1
         if self._n_new < _AGAIN:
             return None
-        self._n_new, self.is_done = 0, len(self.steps) >= _MOST
+        self._n_new, self.steps = 0, self.steps[-_MOST:]
         T, delay_s = self._imu.T_camera_imu, self._imu.delay_s
         found = align(
             Turns.of(self.steps),
@@ -266,29 +260,13 @@ class Alignment:
         )
         if found is None or not found.is_sound:
             return None
-        unsure = max(
-            found.sigma_turn / _SURE_TURN if T is None else 0.0,
-            found.sigma_delay_s / _SURE_DELAY_S if delay_s is None else 0.0,
-        )
-        if unsure > self._unsure:
+        is_turn_sure = T is not None or found.sigma_turn < _SURE_TURN
+        if not is_turn_sure or (delay_s is None and found.sigma_delay_s > _SURE_DELAY_S):
             return None
-        self._unsure = _BETTER * unsure
-        if self._found is not None and not _differs(self._found, found):
-            return None
-        self._found = found
         placed = se3.make_transform(found.R_camera_imu, np.zeros(3)) if T is None else T
         return replace(self._imu, T_camera_imu=placed, delay_s=found.delay_s)
 
-    @property
-    def oldest_ns(self) -> int | None:
-        """From when on samples are needed; None for all to come."""
-        if not self.steps:
-            return None
-        return source_ns(self.steps[0][1]) - round(2e9 * MAX_DELAY_S)
-
-
-def _differs(one: Aligned, other: Aligned) -> bool:
-    """Tell whether two alignments differ by more than it costs to begin anew."""
-    R = one.R_camera_imu.T @ other.R_camera_imu
-    turn = float(se3.rotation_angle(R))
-    return turn > _OTHER_TURN or abs(one.delay_s - other.delay_s) > _OTHER_DELAY_S
+    def oldest_ns(self, stamp_ns: int) -> int:
+        """Return from when on samples are needed after a frame."""
+        first_ns = source_ns(self.steps[0][1]) if self.steps else stamp_ns
+        return first_ns - round(2e9 * MAX_DELAY_S)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gvo.geometry.imu import HOLE_S, ImuSamples
+from gvo.geometry.imu import HOLE_S, ImuSamples, are_in_order
 from gvo.types import FloatArray, IntArray
 
 # No IMU measures as much: m/s^2 and rad/s.
@@ -43,12 +43,12 @@ class ImuBuffer:
         """Add samples; absurd ones, and those not later than all before, are passed over."""
         values = np.hstack([samples.gyro, samples.acceleration])
         is_sane = (np.abs(values) < _LARGEST).all(axis=1)
-        stamps_ns, values = samples.stamps_ns[is_sane], values[is_sane]
-        last_ns = self._stamps_ns[-1] if len(self) else np.iinfo(np.int64).min
-        before = np.maximum.accumulate(np.concatenate([[last_ns], stamps_ns[:-1]]))
-        is_later = stamps_ns > before
-        self._stamps_ns = np.concatenate([self._stamps_ns, stamps_ns[is_later]])
-        self._values = np.concatenate([self._values, values[is_later]])
+        n = max(len(self) - 2, 0)  # the stamp of the last one may turn out to be damaged
+        stamps_ns = np.concatenate([self._stamps_ns[n:], samples.stamps_ns[is_sane]])
+        values = np.concatenate([self._values[n:], values[is_sane]])
+        are_kept = are_in_order(stamps_ns)
+        self._stamps_ns = np.concatenate([self._stamps_ns[:n], stamps_ns[are_kept]])
+        self._values = np.concatenate([self._values[:n], values[are_kept]])
 
     def drop(self, stamp_ns: int) -> None:
         """Drop samples that are not needed for intervals from a stamp of the camera on."""
@@ -70,12 +70,6 @@ class ImuBuffer:
         ends = self._at(start, first), self._at(end, last)
         values = np.vstack([ends[0], self._values[first:last], ends[1]])
         return 1e-9 * np.diff(knots_ns), 0.5 * (values[1:] + values[:-1])
-
-    def mean_rate(self, start_ns: int, end_ns: int) -> FloatArray | None:
-        """Return the mean of the rates (3,) measured in an interval; None if none was."""
-        ends = np.subtract([start_ns, end_ns], self.delay_ns)
-        first, last = np.searchsorted(self._stamps_ns, ends).tolist()
-        return np.asarray(self._values[first:last, :3].mean(axis=0)) if last > first else None
 
     def _has_hole(self, start: int, end: int, near: slice) -> bool:
         """Tell whether a time without samples lies in an interval, or at either end of it."""

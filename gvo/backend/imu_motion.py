@@ -143,9 +143,10 @@ class Preintegrator:
 
         And their covariance (6, 6). None if no sample is near.
         """
-        rate = self._buffer.mean_rate(front.stamp_ns - _NOW_NS // 2, front.stamp_ns + _NOW_NS // 2)
-        if rate is None:
+        pieces = self._buffer.between(front.stamp_ns - _NOW_NS // 2, front.stamp_ns + _NOW_NS // 2)
+        if pieces is None:
             return None
+        rate = 1e9 / _NOW_NS * pieces[0] @ pieces[1][:, :3]
         order = [9, 10, 11, 6, 7, 8]
         covariance = front.covariance[np.ix_(order, order)]
         covariance[:3, 3:] *= -1.0  # a rate is what the bias leaves

@@ -45,7 +45,7 @@ def find_start(
     turned, length_s = np.zeros(3), 1e-9 * (stamps_ns[-1] - stamps_ns[0])
     for motion, step in zip(motions, steps, strict=True):
         if motion is None:
-            return Failure(reason="the IMU has a hole")
+            return Failure(reason="it has no samples at some frames: a hole, or another clock")
         turned += se3.log(se3.invert(step.T_reference_frame) @ motion.T)[:3]
     biases[:3] = turned / length_s
     motions = [integrate.between(*span, biases) for span in pairwise(stamps_ns)]

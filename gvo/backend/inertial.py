@@ -61,7 +61,7 @@ class InertialEstimator:
         self._audit = _Audit()
         self._n_contradictions = 0
         self.n_restarts = self.carried_ns = 0
-        self.reason = "how it sits in the camera and how late it is could not be learnt"
+        self.reason = "the camera has not turned enough to learn how it sits and how late it is"
         self._alignment: Alignment | None = None
         self.imu = imu
         if imu.T_camera_imu is None or imu.delay_s is None:
@@ -120,9 +120,6 @@ class InertialEstimator:
         """
         if self._alignment is not None:
             self._align(self._alignment, stamp_ns, step)
-        if self.imu.T_camera_imu is None or self.imu.delay_s is None:
-            if self._alignment is None:  # learnt in vain
-                self._buffer.drop(stamp_ns)
             return
         step = None if step is None else self._of_imu(step)
         if self._fronts:
@@ -132,8 +129,6 @@ class InertialEstimator:
         oldest = [*self._fronts[:1], self._audit.start]
         oldest_ns = [front.stamp_ns for front in oldest if front is not None]
         oldest_ns += [ns for ns, _ in self._waiting[:1]]
-        if self._alignment is not None and self._alignment.oldest_ns is not None:
-            oldest_ns.append(self._alignment.oldest_ns)
         self._buffer.drop(min([stamp_ns, *oldest_ns]))
 
     def carry(self, reference_ns: int, stamp_ns: int) -> Edge | None:
@@ -185,16 +180,16 @@ class InertialEstimator:
     # Before it has started
 
     def _align(self, alignment: Alignment, stamp_ns: int, step: Edge | None) -> None:
-        """Learn how the IMU sits and how late it is; begin anew with what is known better."""
+        """Learn how the IMU sits and how late it is; start with the latest steps."""
         found = alignment.follow(step, stamp_ns, self._buffer)
-        if found is not None:
-            _LOGGER.info("the IMU is %s", found)
-            self._place(found)
-            self._begin()
-            for ns, each in alignment.steps[-_N_START:-1]:
-                self._wait(ns, self._of_imu(each))
-        if alignment.is_done:
-            self._alignment = None
+        if found is None:
+            self._buffer.drop(alignment.oldest_ns(stamp_ns))
+            return
+        _LOGGER.info("the IMU is %s", found)
+        self._alignment = None
+        self._place(found)
+        for ns, each in alignment.steps[-_N_START:]:
+            self._wait(ns, self._of_imu(each))
 
     def _wait(self, stamp_ns: int, step: Edge | None) -> None:
         """Collect frames that are registered one after the other; start when they are enough."""
@@ -226,7 +221,7 @@ class InertialEstimator:
     def _go_on(self, stamp_ns: int, step: Edge | None) -> None:
         end = self._integrate.advance(self._fronts[-1], stamp_ns)
         if end is None:
-            self._restart(stamp_ns, "a hole in the IMU")
+            self._restart(stamp_ns, "samples were missing")
             return
         known = {front.stamp_ns: front for front in self._fronts}
         self._fronts.append(end)

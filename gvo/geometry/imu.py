@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gvo.config import ImuConfig
 from gvo.geometry import se3
-from gvo.types import FloatArray, IntArray
+from gvo.types import BoolArray, FloatArray, IntArray
 
-_LARGEST_DENSITY = 10.0
+# Sound stamps do not go back so far, nanoseconds.
+_FAR_NS = 10_000_000_000
+
+LARGEST_DENSITY = 10.0
+"""Of noise and random walk, in SI units."""
+
+MAX_SHIFT_S = 60.0
+"""Stamps of an IMU that are given as later by more are of another clock, seconds."""
 
 HOLE_S = 0.1
 """Longer without samples, what an IMU measured is lost, seconds."""
@@ -40,7 +48,8 @@ class Imu:
     Raises
     ------
     ValueError
-        Where the transform is none, or a density is not positive or above 10.
+        Where the transform is none, a density is not positive or above 10, or the delay is longer
+        than a minute.
     """
 
     T_camera_imu: FloatArray | None = None
@@ -59,11 +68,18 @@ class Imu:
             T.setflags(write=False)
             object.__setattr__(self, "T_camera_imu", T)
         for name in ("gyro_noise", "gyro_walk", "acceleration_noise", "acceleration_walk"):
-            if not 0.0 < getattr(self, name) <= _LARGEST_DENSITY:
-                most = f"positive and at most {_LARGEST_DENSITY:g}"
+            if not 0.0 < getattr(self, name) <= LARGEST_DENSITY:
+                most = f"positive and at most {LARGEST_DENSITY:g}"
                 raise ValueError(f"{name} must be {most}, got {getattr(self, name)}")
-        if self.delay_s is not None and not abs(self.delay_s) < np.inf:
-            raise ValueError(f"delay_s must be finite, got {self.delay_s}")
+        if self.delay_s is not None and not abs(self.delay_s) <= MAX_SHIFT_S:
+            raise ValueError(f"delay_s must be within {MAX_SHIFT_S:g}, got {self.delay_s}")
+
+    def with_settings(self, config: ImuConfig) -> Imu:
+        """Return the IMU with what is configured of it."""
+        names = "gyro_noise", "gyro_walk", "acceleration_noise", "acceleration_walk"
+        given = {name: getattr(config, name) for name in names}
+        given["delay_s"] = None if config.delay_ms is None else 1e-3 * config.delay_ms
+        return replace(self, **{name: value for name, value in given.items() if value is not None})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -104,12 +120,33 @@ class ImuSamples:
 
     @classmethod
     def of(cls, stamps_ns: ArrayLike, gyro: ArrayLike, acceleration: ArrayLike) -> ImuSamples:
-        """Return samples of anything that becomes such arrays."""
-        return cls(
-            stamps_ns=np.atleast_1d(np.asarray(stamps_ns, dtype=np.int64)),
-            gyro=np.atleast_2d(np.asarray(gyro, dtype=np.float64)),
-            acceleration=np.atleast_2d(np.asarray(acceleration, dtype=np.float64)),
-        )
+        """Return samples of anything that becomes such arrays.
+
+        Raises
+        ------
+        ValueError
+            Where stamps are no whole numbers, as seconds are, or the shapes do not fit.
+        """
+        stamps = np.atleast_1d(np.asarray(stamps_ns))
+        if len(stamps) > 0 and stamps.dtype.kind not in "iu":
+            raise ValueError(f"stamps_ns must be whole nanoseconds, got {stamps.dtype}")
+        vectors = [np.atleast_2d(np.asarray(each, float)) for each in (gyro, acceleration)]
+        vectors = [each if each.size else np.zeros((0, 3)) for each in vectors]
+        return cls(stamps_ns=stamps.astype(np.int64), gyro=vectors[0], acceleration=vectors[1])
+
+
+def are_in_order(stamps_ns: IntArray) -> BoolArray:
+    """Tell which stamps (n,) are later than all before, but for damaged ones in the far future.
+
+    Such a stamp is known by the next one, which is far before it and after the one before it.
+    """
+    ends = np.iinfo(np.int64)
+    before = np.concatenate([[ends.min], stamps_ns])[:-1]
+    after = np.concatenate([stamps_ns, [ends.max]])[1:]
+    is_damaged = (before < after) & (after < stamps_ns - _FAR_NS)
+    latest = np.maximum.accumulate(np.where(is_damaged, ends.min, stamps_ns))
+    is_later = latest > np.concatenate([[ends.min], latest])[:-1]
+    return np.asarray(is_later & ~is_damaged)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

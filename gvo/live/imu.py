@@ -67,7 +67,7 @@ class ImuQueue:
         while messages := self._take(now_s + _PATIENCE_S if self._is_due(stamp_ns) else now_s):
             samples = self._decoder.take(messages)
             if len(samples) > 0:
-                self._last_ns, came_s = int(samples.stamps_ns[-1]), time.monotonic()
+                self._last_ns, came_s = int(samples.stamps_ns[-2:].min()), time.monotonic()
                 self._note(is_silent=False)
                 yield samples
         self._came_s = came_s

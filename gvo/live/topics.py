@@ -125,7 +125,7 @@ class NetworkReader:
             if topic.name not in self._kept:
                 self._subscribe(topic)
 
-    def messages(self, names: Collection[str], *, start_ns: int = 0) -> Iterator[BagMessage]:
+    def messages(self, names: Collection[str]) -> Iterator[BagMessage]:
         """Yield messages received so far: up to a hundred of each topic, one of image topics.
 
         Raises
@@ -139,7 +139,6 @@ class NetworkReader:
                 raise RecordingError(f"{self.transport.name}: nothing came on {name}")
         with self._changed:
             kept = [message for name in names for message in self._kept[name]]
-        kept = [message for message in kept if message.log_time_ns >= start_ns]
         yield from sorted(kept, key=lambda message: message.log_time_ns)
 
     def images(self) -> Iterator[BagMessage]:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from gvo.backend.inertial import InertialEstimator
 from gvo.backend.keyframe_policy import LINK_GAIN, choose_unseen, is_needed
 from gvo.backend.window import SlidingWindow
-from gvo.config import Config, ImuConfig
+from gvo.config import Config
 from gvo.frontend.depth_icp import DepthTrust
 from gvo.frontend.descriptor import as_stereo
 from gvo.frontend.factory import find_change, frame_of, make_frontend
@@ -128,17 +128,19 @@ class Odometry:
         self._is_broken = False  # the raw chain, by a guess
         self._anchor_ns: int | None = None
         self._previous: Estimate | None = None  # by the raw chain
+        self._imu = imu or Imu()
         self._inertial: InertialEstimator | None = None
         if imu is not None and self._config.imu.enabled:
-            self._use(imu)
+            self._use_imu()
         self._map = Map(self._config, self._frontend.recognizer, self._window, self._keyframes)
         self._trust = DepthTrust()
         self._poses = array("d")  # raw and causal ones, upper three rows
         self.link_gain = LINK_GAIN
 
-    def _use(self, imu: Imu) -> None:
-        known = _with_settings(imu, self._config.imu)
-        self._inertial = InertialEstimator(known, max_coast_s=self._config.imu.max_coast_s)
+    def _use_imu(self) -> None:
+        config = self._config.imu
+        known = self._imu.with_settings(config)
+        self._inertial = InertialEstimator(known, max_coast_s=config.max_coast_s)
 
     @property
     def config(self) -> Config:
@@ -215,7 +217,8 @@ class Odometry:
     def add_imu(self, stamps_ns: ArrayLike, gyro: ArrayLike, acceleration: ArrayLike) -> None:
         """Take samples of the IMU: all up to the next frame, before it.
 
-        Of one that was not given at construction, how it sits and how late it is are learnt.
+        Those that are no numbers, absurd, or not later than all before are passed over. Of an IMU
+        that was not given at construction, how it sits and how late it is are learnt.
 
         Parameters
         ----------
@@ -229,11 +232,11 @@ class Odometry:
         Raises
         ------
         ValueError
-            Where shapes do not fit.
+            Where stamps are no whole numbers, as seconds are, or shapes do not fit.
         """
         samples = ImuSamples.of(stamps_ns, gyro, acceleration)
         if self._inertial is None and self._config.imu.enabled:
-            self._use(Imu())
+            self._use_imu()
         if self._inertial is not None:
             self._inertial.add(samples)
 
@@ -625,14 +628,6 @@ class Odometry:
             self._window.release(previous)
         if self._anchor_ns in self._window:
             self._window.keep(self._anchor_ns)
-
-
-def _with_settings(imu: Imu, config: ImuConfig) -> Imu:
-    """Return an IMU with what is configured of it."""
-    names = "gyro_noise", "gyro_walk", "acceleration_noise", "acceleration_walk"
-    given = {name: getattr(config, name) for name in names}
-    given["delay_s"] = None if config.delay_ms is None else 1e-3 * config.delay_ms
-    return replace(imu, **{name: value for name, value in given.items() if value is not None})
 
 
 def _check_frame(frame: Stamped, camera: StereoCamera | PinholeCamera) -> None:

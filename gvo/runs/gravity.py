@@ -49,7 +49,7 @@ def align_with_gravity(
     """
     info, config = loop.source.info, loop.config
     if info.imu is None or not config.imu.enabled:
-        why = "the recording has no IMU" if info.imu is None else "imu.enabled is false"
+        why = "no IMU is used" if info.imu is None else "imu.enabled is false"
         raise ConfigurationError(f"--gravity-aligned: {info.name}: {why}; run without it")
     search = _Search(loop.source)
     beginning = ChosenImages(info=info, images=search.images)
@@ -60,6 +60,8 @@ def align_with_gravity(
         loop.first_pose = partial(_first_pose, search.up, loop.base_frame, loop.first_pose)
     elif (inertial := ahead.statistics.inertial) is not None:
         why = f"the IMU was not used: {inertial.reason}"
+        if search.is_lost:
+            why = "the camera was lost before the IMU could tell which way is up"
         fault = f"--gravity-aligned: the world is not turned, {why}"
         loop.output_faults.append(said(fault))
 
@@ -83,13 +85,13 @@ class _Search:
     def __init__(self, source: Source) -> None:
         self._source = source
         self._end_ns: int | None = None
-        self._is_sure = False
+        self._is_done = self.is_lost = False
         self.up: FloatArray | None = None
 
     def images(self) -> Iterator[StampedImage]:
         """Yield images until it is known."""
         for image in self._source.images():
-            if self._is_sure or (self._end_ns is not None and image.stamp_ns > self._end_ns):
+            if self._is_done or (self._end_ns is not None and image.stamp_ns > self._end_ns):
                 return
             yield image
 
@@ -100,12 +102,14 @@ class _Search:
         if self._end_ns is None:
             self._end_ns = result.stamp_ns + _SEARCHED_NS
         state, is_measured = result.inertial, result.status in (Status.OK, Status.RESUMED)
-        if state is None or not is_measured or result.segment > 0:
+        if result.segment > 0:  # another world has begun
+            self._is_done = self.is_lost = True
+        if state is None or not is_measured or self.is_lost:
             return
         if self.up is None:
             self._end_ns = min(self._end_ns, result.stamp_ns + _PATIENCE_NS)
         self.up = result.causal.T_world_frame[:3, :3] @ state.up
-        self._is_sure = bool(state.sigmas[0] < _SURE)
+        self._is_done = bool(state.sigmas[0] < _SURE)
 
 
 def _upright(

@@ -138,10 +138,11 @@ class Sensor:
     share_missing: float = 0.0
     hole_s: tuple[float, float] = (0.0, 0.0)
     gyro_unit: float = 1.0
+    rate_hz: float = SAMPLES_HZ
     seed: int = 0
 
     def measure(self, hand: Hand, end_s: float, start_s: float = -0.2) -> ImuSamples:
-        times_s = np.arange(start_s, end_s, 1.0 / SAMPLES_HZ)
+        times_s = np.arange(start_s, end_s, 1.0 / self.rate_hz)
         rng, shape = np.random.default_rng(self.seed), (len(times_s), 3)
         gyro = self.gyro_unit * hand.gyro(times_s) + self.gyro_bias
         force = hand.force(times_s) + self.acceleration_bias

@@ -121,6 +121,25 @@ def test_samples_that_repeat_or_go_back_or_are_absurd_are_passed_over(seed: int)
     assert buffer.gyro.shape == (len(buffer), 3)
 
 
+@pytest.mark.parametrize("damaged_ns", [0, START_NS + 10**15, 2**63 - 1, -(2**63)])
+@pytest.mark.parametrize("n_at_once", [1, 3, 20])
+@pytest.mark.parametrize("place", [2, 5, 9, 18])
+def test_a_damaged_stamp_costs_one_sample(damaged_ns: int, n_at_once: int, place: int) -> None:
+    stamps_ns = np.array([ns(0.01 * k) for k in range(20)])
+    spoilt = stamps_ns.copy()
+    spoilt[place] = damaged_ns
+    buffer = ImuBuffer()
+    for start in range(0, 20, n_at_once):
+        part = spoilt[start : start + n_at_once]
+        buffer.add(samples_of(part, np.ones((len(part), 6))))
+    np.testing.assert_array_equal(buffer.stamps_ns, np.delete(stamps_ns, place))
+
+
+def test_all_samples_may_be_added_at_once() -> None:
+    stamps_ns = [ns(0.1 * k) for k in range(3000)]
+    assert filled(stamps_ns).stamps_ns.tolist() == stamps_ns
+
+
 @given(st.integers(-100_000_000, 100_000_000), shares)
 def test_a_delay_shifts_stamps_to_the_clock_of_the_camera(delay_ns: int, at: list[float]) -> None:
     stamps_ns = [ns(0.01 * k) for k in range(21)]

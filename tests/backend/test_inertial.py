@@ -146,6 +146,13 @@ def test_the_state_is_wrong_by_as_much_as_it_says(sigmas: tuple[float, float]) -
     assert 0.15 < sizes.min() < sizes.max() < 2.0
 
 
+@pytest.mark.parametrize("rate_hz", [50.0, 100.0, 200.0, 333.0])
+def test_there_is_a_state_at_each_frame_at_any_rate(rate_hz: float) -> None:
+    ride = Ride(estimator(), sensor=Sensor(rate_hz=rate_hz)).ride(1.0)
+    for time_s in ride.go(3.0):
+        np.testing.assert_allclose(state_of(ride).twist, true_twist(time_s, ride), atol=0.02)
+
+
 def test_turns_since_the_way_began_make_no_velocity_less_sure() -> None:
     errors = []
     for seed in range(6):

@@ -110,7 +110,7 @@ def test_the_initial_pose_moves_all_poses(
         (["--initial-pose", "1,2"], ["--initial-pose", "X,Y,Z"]),
         (["--initial-pose", "0,0,0,1,1,1,1"], ["--initial-pose", "length 2"]),
         (["--initial-pose", "truth"], ["--initial-pose truth", "no ground truth"]),
-        (["--gravity-aligned"], ["--gravity-aligned", "robot", "has no IMU"]),
+        (["--gravity-aligned"], ["--gravity-aligned", "robot", "no IMU is used"]),
         (["--frame", "gripper"], ["--frame gripper", CAMERA]),
         (["--ground-truth", "tf:map"], ["tf:map", "two frames"]),
         (["--ground-truth", "tf:map:gripper"], ["gripper", "map"]),

@@ -17,9 +17,9 @@ def test_a_density_that_is_not_positive_is_refused(name: Any, value: float) -> N
         Imu(**{name: value})  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("value", [np.inf, np.nan])
-def test_a_delay_must_be_finite(value: float) -> None:
-    with pytest.raises(ValueError, match="delay_s must be finite"):
+@pytest.mark.parametrize("value", [np.inf, np.nan, 1e300, -60.1])
+def test_a_delay_must_be_short(value: float) -> None:
+    with pytest.raises(ValueError, match="delay_s must be within 60"):
         Imu(delay_s=value)
 
 
@@ -45,6 +45,17 @@ def test_one_sample_may_be_given_as_plain_numbers() -> None:
     assert samples.stamps_ns.tolist() == [7]
     assert samples.gyro.tolist() == [[1.0, 2.0, 3.0]]
     assert samples.acceleration.tolist() == [[4.0, 5.0, 6.0]]
+
+
+@pytest.mark.parametrize("nothing", [[], np.zeros((0, 3))])
+def test_no_samples_may_be_given(nothing: Any) -> None:
+    assert ImuSamples.of([], nothing, nothing).gyro.shape == (0, 3)
+
+
+@pytest.mark.parametrize("stamps_ns", [[1403.5, 1403.6], [True, False], [None, None], [1j, 2j]])
+def test_stamps_that_are_no_whole_numbers_are_refused(stamps_ns: Any) -> None:
+    with pytest.raises(ValueError, match="whole nanoseconds"):
+        ImuSamples.of(stamps_ns, np.zeros((2, 3)), np.zeros((2, 3)))
 
 
 @pytest.mark.parametrize(

@@ -228,6 +228,19 @@ def test_an_imu_that_was_not_enabled_at_the_start_is_not_used_in_this_run() -> N
     assert not found.carried()
 
 
+def test_an_imu_that_is_enabled_later_is_the_one_that_was_given() -> None:
+    given = Imu(T_camera_imu=np.diag([1.0, -1.0, -1.0, 1.0]), delay_s=0.01)
+    odometry, frame = Odometry(lit().info.camera, with_imu(enabled=False), imu=given), lit()
+    odometry.reconfigure(Config())
+    odometry.track(next(iter(frames_of(frame))))
+    assert odometry.inertial is None
+    odometry.add_imu([0], np.zeros((1, 3)), np.zeros((1, 3)))
+    assert odometry.inertial is not None
+    assert odometry.inertial.imu is not given
+    assert odometry.inertial.imu.delay_s == 0.01
+    np.testing.assert_array_equal(odometry.inertial.imu.T_camera_imu, given.T_camera_imu)
+
+
 def test_a_delay_that_is_configured_stands_above_that_of_the_recording() -> None:
     late_s = 0.05  # which the recording does not know of
     truth = lit().ground_truth()

@@ -47,14 +47,18 @@ def check_imu(stream: ImuStream, images_ns: IntArray, seen: Turns) -> Iterator[F
         n = f"{len(stamps_ns)} samples in {stream.name}"
         yield judged("imu: samples", n, is_ok=False, threshold=">= 2", fix="record the IMU")
         return
+    values = np.concatenate([np.hstack([part.gyro, part.acceleration]) for part in parts])
+    is_number = np.isfinite(values).all(axis=1)
     yield Finding(name="imu", value=f"{stream.name}, {len(stamps_ns)} samples")
+    if not is_number.all():
+        n, fix = f"{np.sum(~is_number)} are no numbers", "they are skipped: mend the driver"
+        yield judged("imu: values", n, is_ok=False, threshold="numbers", fix=fix)
     yield from _check_stamps(stamps_ns, images_ns)
-    order = np.unique(stamps_ns, return_index=True)[1]
-    samples = ImuSamples(
-        stamps_ns=stamps_ns[order],
-        gyro=np.concatenate([part.gyro for part in parts])[order],
-        acceleration=np.concatenate([part.acceleration for part in parts])[order],
-    )
+    if not is_number.any():
+        return
+    order, kept = np.unique(stamps_ns[is_number], return_index=True)
+    gyro, acceleration = np.hsplit(values[is_number][kept], 2)
+    samples = ImuSamples(stamps_ns=order, gyro=gyro, acceleration=acceleration)
     yield _check_gravity(samples)
     yield _check_saturation(samples)
     yield from _check_alignment(stream, samples, seen)

@@ -110,8 +110,8 @@ class BagFile:
         lost = "" if self._scan is None else self._scan.damage
         return "; ".join(text for text in (self._fault, lost) if text)
 
-    def messages(self, names: Collection[str], start_ns: int = 0) -> Iterator[FoundMessage]:
-        """Yield the messages of some topics, nearly in the order of recording, from a time on.
+    def messages(self, names: Collection[str]) -> Iterator[FoundMessage]:
+        """Yield the messages of some topics, nearly in the order of recording.
 
         Where rosbags cannot go on, the rest of a ROS 1 or MCAP file is read record by record; of
         a database it is lost, and `damage` says so.
@@ -120,10 +120,10 @@ class BagFile:
         seen: dict[Channel, array[int]] = defaultdict(partial(array, "Q"))
         try:
             if self._scan is None:
-                for message in self._indexed(names, start_ns):
+                for message in self._indexed(names):
                     seen[message.topic].append(message.log_time_ns % 2**64)
                     yield message
-                self._check_number(sum(map(len, seen.values())), names, start_ns)
+                self._check_number(sum(map(len, seen.values())), names)
                 return
         except DAMAGE as error:
             try:
@@ -132,15 +132,12 @@ class BagFile:
                 self._fault = str(refusal)
                 return
         try:
-            yield from self._unseen(self._scan.messages(names), seen, start_ns)
+            yield from self._unseen(self._scan.messages(names), seen)
         except DAMAGE as error:  # as of a file that is shortened meanwhile
             self._fault = f"{self.path}: cannot be read on ({_one_line(error)})"
 
     def _unseen(
-        self,
-        messages: Iterable[FoundMessage],
-        seen: Mapping[Channel, Iterable[int]],
-        start_ns: int,
+        self, messages: Iterable[FoundMessage], seen: Mapping[Channel, Iterable[int]]
     ) -> Iterator[FoundMessage]:
         counts = {channel: Counter(log_times) for channel, log_times in seen.items()}
         for message in messages:
@@ -150,23 +147,22 @@ class BagFile:
             log_time = message.log_time_ns % 2**64
             if counts.get(message.topic, Counter())[log_time] > 0:
                 counts[message.topic][log_time] -= 1
-            elif message.log_time_ns >= start_ns:
+            else:
                 yield message
 
-    def _check_number(self, n_messages: int, names: Collection[str], start_ns: int) -> None:
-        """Check what rosbags read, if that is all: it skips some damage silently."""
+    def _check_number(self, n_messages: int, names: Collection[str]) -> None:
+        """Check what rosbags read: it skips some damage silently."""
         n_announced = sum(n for channel, n in self.counts.items() if channel.name in names)
-        if n_messages < n_announced and start_ns <= 0:
+        if n_messages < n_announced:
             raise DamageError(f"{n_messages} of {n_announced} messages were found")
 
-    def _indexed(self, names: Collection[str], start_ns: int) -> Iterator[FoundMessage]:
+    def _indexed(self, names: Collection[str]) -> Iterator[FoundMessage]:
         with self._opened() as reader:
             connections = [c for c in reader.connections if c.topic in names]
             channels = {c.id: _channel(c, reader) for c in connections}
             is_ros1 = isinstance(reader, Reader1)
             # Without any, rosbags would yield all.
-            start = start_ns if start_ns > 0 else None
-            messages = reader.messages(connections, start) if connections else ()
+            messages = reader.messages(connections=connections) if connections else ()
             for connection, log_time_ns, data in messages:
                 if not isinstance(log_time_ns, int) or not isinstance(data, bytes):
                     raise TypeError("a row of the database is not a message")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from difflib import SequenceMatcher
@@ -12,7 +11,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from gvo.errors import RecordingError
-from gvo.geometry.imu import HOLE_S, ImuSamples
+from gvo.geometry.imu import HOLE_S, ImuSamples, are_in_order
 from gvo.io.bag.messages import bare
 from gvo.io.bag.reader import BagMessage, MessageReader
 from gvo.io.bag.topics import IMU_TYPE, Topic, asked_topic, find_topic, n_common_parts
@@ -28,11 +27,9 @@ _N_FIRST, _N_AT_ONCE = 50, 300
 _HOLE_NS = round(1e9 * HOLE_S)
 # Of a gyro that wait for accelerations.
 _N_PENDING = 5_000
-# By how much the clocks of IMU and camera may differ, and how much earlier than the first of a
-# topic its messages may be recorded.
-_OTHER_CLOCK_S, _EARLY_NS = 10.0, 5_000_000_000
+# By how much the clocks of IMU and camera may differ.
+_OTHER_CLOCK_S = 10.0
 _LATEST_NS = 2**63 - 1  # in MCAP it may be later
-_WORD = re.compile(r"[_/]")
 _N_LISTED = 5
 
 
@@ -86,7 +83,7 @@ class _Look(NamedTuple):
 
 def find_imu(
     reader: MessageReader,
-    camera: tuple[Topic, str],
+    camera: Topic,
     asked: str | None,
     hint: str,
     where: str,
@@ -98,8 +95,8 @@ def find_imu(
     Parameters
     ----------
     reader : MessageReader
-    camera : tuple of Topic and str
-        Of the left or colour images, and their frame.
+    camera : Topic
+        Of the left or colour images.
     asked : str or None
         Topic that the user chose.
     hint : str
@@ -129,7 +126,7 @@ def find_imu(
     if imu is not None:
         first = None
         with suppress(RecordingError):  # in a network no image may have come yet
-            first = next(_first(reader, camera[0], stamp_of), None)
+            first = next(_first(reader, camera, stamp_of), None)
         offset_s = 0.0 if first is None else 1e-9 * (imu.clock_ns - first[0])
         if abs(offset_s) <= _OTHER_CLOCK_S:
             return imu
@@ -182,36 +179,25 @@ def _complete(look: _Look, looks: Sequence[_Look], wanted: Topic | None) -> BagI
     return BagImu(look.topic, acceleration, look.frame_id, look.clock_ns)
 
 
-def _best(found: Sequence[BagImu], camera: tuple[Topic, str], hint: Topic | None) -> BagImu | None:
-    """Return the IMU that a calibration names, else the nearest by its name, else the fastest.
-
-    None where only the rate would decide and is not known, as in a network.
-    """
+def _best(found: Sequence[BagImu], camera: Topic, hint: Topic | None) -> BagImu | None:
+    """Return the IMU that a calibration names, else the one whose name is alone the nearest."""
     if len(found) < 2:
         return next(iter(found), None)
-
-    def nearness(imu: BagImu) -> int:
-        words = [_WORD.split(frame)[0] for frame in (imu.frame_id, camera[1])]
-        return n_common_parts(imu.gyro, camera[0]) + (words[0] == words[1] != "")
-
     hinted = [imu for imu in found if imu.gyro == hint]
-    best = max(hinted or found, key=lambda imu: (nearness(imu), imu.gyro.n_messages))
-    n_as_near = sum(nearness(imu) == nearness(best) for imu in found)
-    if not hinted and n_as_near > 1 and best.gyro.n_messages == 1:
+    nearness = [n_common_parts(imu.gyro, camera) for imu in found]
+    nearest = [imu for imu, near in zip(found, nearness, strict=True) if near == max(nearness)]
+    if len(chosen := hinted or nearest) > 1:
         return None
-    is_nearest = any(nearness(imu) < nearness(best) for imu in found)
-    why = "as the calibration says" if hinted else "by its name" if is_nearest else "by its rate"
-    others = ", ".join(imu.gyro.name for imu in found if imu is not best)
-    return best._replace(why=f", {why}; --imu takes another of {others}")
+    why = "as the calibration says" if hinted else "by its name"
+    others = ", ".join(imu.gyro.name for imu in found if imu is not chosen[0])
+    return chosen[0]._replace(why=f", {why}; --imu takes another of {others}")
 
 
 def read_samples(
     reader: MessageReader, imu: BagImu, stamp_of: StampOf, start_ns: int
 ) -> Iterator[ImuSamples]:
     """Yield the samples of an IMU from a stamp on, some at a time."""
-    recorded_ns = max(start_ns + imu.clock_ns - _EARLY_NS, 0)
-    messages = reader.messages(imu.names, start_ns=recorded_ns if start_ns > 0 else 0)
-    decoder = SampleDecoder(imu, stamp_of, start_ns)
+    messages, decoder = reader.messages(imu.names), SampleDecoder(imu, stamp_of, start_ns)
     while block := list(islice(messages, _N_AT_ONCE)):
         yield decoder.take(block)
 
@@ -273,8 +259,8 @@ class _Pairing:
         gyro = np.concatenate([self._gyro, values[is_gyro, :3]])
         known_ns = np.concatenate([self._known_ns, stamps_ns[~is_gyro]])
         known = np.concatenate([self._known, values[~is_gyro, 3:]])
-        is_later = np.diff(np.maximum.accumulate(known_ns), prepend=known_ns[:1] - 1) > 0
-        known_ns, known = known_ns[is_later], known[is_later]
+        are_kept = are_in_order(known_ns)
+        known_ns, known = known_ns[are_kept], known[are_kept]
         last_ns = known_ns.max(initial=0)
         is_due = gyro_ns <= last_ns
         is_kept = known_ns >= last_ns - _HOLE_NS

@@ -79,8 +79,8 @@ class MessageReader(Protocol):
     def damage(self) -> str:
         """What cannot be read, in one line."""
 
-    def messages(self, names: Collection[str], *, start_ns: int = 0) -> Iterator[BagMessage]:
-        """Yield the messages of some topics in the order of recording, from a time of it on."""
+    def messages(self, names: Collection[str]) -> Iterator[BagMessage]:
+        """Yield the messages of some topics in the order of recording."""
 
 
 class BagReader:
@@ -133,23 +133,17 @@ class BagReader:
         return self._files if self._are_loose and len(self._files) > 1 else []
 
     def messages(
-        self,
-        names: Collection[str],
-        *,
-        files: Sequence[BagFile] | None = None,
-        start_ns: int = 0,
+        self, names: Collection[str], *, files: Sequence[BagFile] | None = None
     ) -> Iterator[BagMessage]:
         """Yield the messages of some topics in the order of recording, over all files or some.
 
-        Those recorded before `start_ns` are left out. What is damaged is left out, see `damage`;
-        in a file without an index the order is that of its chunks. A file is opened when its
-        first message is due.
+        What is damaged is left out, see `damage`; in a file without an index the order is that
+        of its chunks. A file is opened when its first message is due.
         """
         streams = [
-            _begin(file, names, start_ns)
+            _begin(file, names)
             for file in files or self._files
             if any(channel.name in names for channel in file.counts)
-            and file.end_time_ns >= start_ns
         ]
         for _, message in merge(*streams, key=lambda item: item[0]):
             if message is not None:
@@ -215,12 +209,10 @@ class BagReader:
         return file
 
 
-def _begin(
-    file: BagFile, names: Collection[str], start_ns: int
-) -> Iterator[tuple[int, FoundMessage | None]]:
+def _begin(file: BagFile, names: Collection[str]) -> Iterator[tuple[int, FoundMessage | None]]:
     # The first item keeps the file closed until its time has come.
     yield file.start_time_ns, None
-    for message in file.messages(names, start_ns):
+    for message in file.messages(names):
         yield message.log_time_ns, message
 
 

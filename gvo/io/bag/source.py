@@ -145,7 +145,7 @@ class BagSource:
             found = calibrations_of_messages(reader, self._topics, where, topics.camera_info)
         self._info_names = set(found.info_names)
         self._scale = config.depth.scale or found.depth_scale or MILLIMETRES
-        self._images_config = config.images
+        self._images_config, self._imu_config = config.images, config.imu
         self.info = self._describe(found)
         return found
 
@@ -153,13 +153,13 @@ class BagSource:
         self, topics: TopicChoice | None, found: BagCalibration, facts: ImuFacts
     ) -> BagImu | None:
         """Add the IMU to what is known, placed by the calibration, else by tf; return it."""
-        camera, asked = (self._topics.first, found.frame_id), topics.imu if topics else None
+        camera, asked = self._topics.first, topics.imu if topics else None
         hint = facts.get("topic", "")
         chosen = find_imu(self._reader, camera, asked, hint, self._where, stamp_of=self._stamp_of)
         if isinstance(chosen, Failure):
             self.info.decisions.extend(f"imu: none: {each}" for each in [chosen.reason] if each)
             return None
-        imu, origin = make_imu(facts, found.T_body_cam), "the calibration"
+        imu, origin = make_imu(facts, found.T_body_cam, self._imu_config), "the calibration"
         if imu.T_camera_imu is None:
             mount = self._mount(chosen)
             if not isinstance(mount, Failure):

@@ -10,6 +10,7 @@ from typing import TypeAlias
 import numpy as np
 
 from gvo._text import access_fault
+from gvo.config import ImuConfig
 from gvo.errors import CalibrationError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
@@ -134,12 +135,15 @@ def split_imu(calibration: CalibrationPaths) -> tuple[tuple[Path, ...], ImuFacts
     return tuple(path for path in given if path not in said), facts
 
 
-def make_imu(facts: ImuFacts, T_body_cam: FloatArray | None) -> Imu:
-    """Return an IMU of what is said of it, and of where the rectified camera is on the body."""
+def make_imu(facts: ImuFacts, T_body_cam: FloatArray | None, config: ImuConfig) -> Imu:
+    """Return an IMU of what is said of it, and of where the rectified camera is on the body.
+
+    What is configured counts before.
+    """
     values = {key: value for key, value in facts.items() if key in _OF_IMU}
     if T_body_cam is not None and "T_body_imu" in facts:
         values["T_camera_imu"] = se3.normalize(se3.invert(T_body_cam) @ facts["T_body_imu"])
-    return Imu(**values)
+    return Imu(**values).with_settings(config)
 
 
 def with_imu(info: RecordingInfo, stream: ImuStream, what: str, origin: str) -> RecordingInfo:

@@ -15,6 +15,7 @@ import yaml
 from gvo._text import MAX_CHARACTERS, YamlError, access_fault, load_yaml, read_text, shortened
 from gvo.errors import CalibrationError, named_faults
 from gvo.geometry import se3
+from gvo.geometry.imu import LARGEST_DENSITY, MAX_SHIFT_S
 from gvo.io.calibration.camera_info import (
     ROTATION_TOLERANCE,
     CameraFields,
@@ -132,8 +133,9 @@ def read_imu_file(path: Path) -> ImuFacts:
     for name, key in IMU_DENSITIES.items():
         if key in own:
             facts[name] = float(_array(own, key, (1,), str(path))[0])
-            if facts[name] <= 0.0:
-                raise CalibrationError(f"{path}: {key} must be positive, got {facts[name]:g}")
+            if not 0.0 < facts[name] <= LARGEST_DENSITY:
+                most = f"positive and at most {LARGEST_DENSITY:g}"
+                raise CalibrationError(f"{path}: {key} must be {most}, got {facts[name]:g}")
     if "T_BS" in own:
         facts["T_body_imu"] = _transform(own, {"T_BS": False}, str(path))
     return facts | ({"topic": str(own["rostopic"])} if "rostopic" in own else {})
@@ -143,7 +145,9 @@ def _imu_beside(content: Content, where: str) -> ImuFacts:
     """Return what a camera or an IMU says of how both belong together."""
     facts: ImuFacts = {"T_body_imu": np.eye(4)} if any(map(content.get, _TO_IMU)) else {}
     if content.get(TIMESHIFT) is not None:
-        facts["delay_s"] = 0.0 - float(_array(content, TIMESHIFT, (1,), where)[0])
+        facts["delay_s"] = shift_s = 0.0 - float(_array(content, TIMESHIFT, (1,), where)[0])
+        if not abs(shift_s) <= MAX_SHIFT_S:
+            raise CalibrationError(f"{where}: {TIMESHIFT} must be within {MAX_SHIFT_S:g} s")
     elif TIMESHIFT in content:
         facts["delay_s"] = None  # it is said not to be known
     return facts

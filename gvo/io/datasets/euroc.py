@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from gvo.config import Config
+from gvo.config import Config, ImuConfig
 from gvo.errors import CalibrationError, RecordingError
 from gvo.geometry import se3
 from gvo.geometry.imu import ImuStream
@@ -79,16 +79,16 @@ class EurocSource(FolderSource):
         super().__init__(named, cameras, images, decisions, config)
         table = self._root / "imu0" / "data.csv"
         if imu is not None and table.is_file():
-            self._add_imu(table, {**imu, **cameras.imu})
+            self._add_imu(table, {**imu, **cameras.imu}, (config or Config()).imu)
 
-    def _add_imu(self, table: Path, given: ImuFacts) -> None:
+    def _add_imu(self, table: Path, given: ImuFacts, config: ImuConfig) -> None:
         """Add the IMU to what is known; its clock is that of the cameras, if nothing else is said.
 
         The first samples are read, so that a file of another form is refused before any work.
         """
         sensor = table.with_name("sensor.yaml")
         own = read_imu_file(sensor) if sensor.is_file() else {}
-        imu = make_imu({"delay_s": 0.0, **own, **given}, self._T_body_cam)
+        imu = make_imu({"delay_s": 0.0, **own, **given}, self._T_body_cam, config)
         if next(read_imu_table(table, 0), None) is None:
             raise RecordingError(f"{table}: holds no rows; mend it, or give --imu none")
         stream = ImuStream(name="imu0", imu=imu, samples=partial(read_imu_table, table))

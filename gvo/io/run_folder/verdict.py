@@ -146,7 +146,7 @@ def imu_words(summary: Mapping[str, Any]) -> str:
         longest_s = f" in all, {imu['longest_s']:.2g} s at the longest" if n > 1 else ""
         words = [f"the IMU carried the camera {_times(n)}, {sum_s}{longest_s}"]
     if n_restarts:
-        words.append(f"it began anew {_times(n_restarts)}: {imu['reason']}")
+        words.append(f"it was interrupted {_times(n_restarts)}: {imu['reason']}")
     if imu["is_delay_learnt"]:
         words.append(f"its delay of {imu['delay_ms']:.2g} ms was learnt")
     return "; ".join(words)

@@ -114,6 +114,19 @@ def test_a_delay_and_a_rotation_that_the_recording_does_not_tell_are_named() -> 
     assert "learnt" in str(unknown["imu: rotation"].value)
 
 
+def test_samples_that_are_no_numbers_are_counted_and_left_out() -> None:
+    def spoilt(samples: ImuSamples) -> ImuSamples:
+        gyro = samples.gyro.copy()
+        gyro[len(gyro) // 2 :: 2, 1] = np.nan
+        return replace(samples, gyro=gyro)
+
+    found = check(spoilt)
+    assert complaints(found) == {"imu: values": "warning"}
+    assert found["imu: gravity"].verdict == "ok"
+    empty = check(lambda samples: replace(samples, acceleration=np.nan * samples.acceleration))
+    assert complaints(empty) == {"imu: values": "warning"}
+
+
 def test_a_clipped_axis_is_saturated() -> None:
     def clipped(samples: ImuSamples) -> ImuSamples:
         largest = float(np.abs(samples.acceleration).max())

@@ -328,8 +328,8 @@ IMU |= {"n_restarts": 0, "reason": "", "is_delay_learnt": False, "delay_ms": 0.0
         ),
         (
             {"n_gaps": 3, "carried_s": 4.2, "longest_s": 2.5, "n_restarts": 1, "reason": "a hole"},
-            "the IMU carried the camera 3 times, 4.2 s in all, 2.5 s at the longest; it began anew "
-            "once: a hole",
+            "the IMU carried the camera 3 times, 4.2 s in all, 2.5 s at the longest; it was "
+            "interrupted once: a hole",
         ),
         (
             {"is_delay_learnt": True, "delay_ms": 4.13},
