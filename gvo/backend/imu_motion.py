@@ -11,6 +11,7 @@ axes that move along).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -210,10 +211,12 @@ class Preintegrator:
     def _is_still(self, front: Front, motion: Motion) -> bool:
         """Tell whether the IMU felt nothing but gravity after a front."""
         t, imu = motion.length_s, self._imu
-        turn, n_sigmas = se3.rotation_angle(motion.T) / t, _STILL_SIGMAS / np.sqrt(t)
-        most = _STILL_ACCELERATION + n_sigmas * imu.acceleration_noise
-        is_still = np.linalg.norm(motion.velocity / t + front.gravity) < most
-        return bool(is_still and turn < _STILL_TURN + n_sigmas * imu.gyro_noise)
+        n_sigmas = _STILL_SIGMAS / sqrt(t)
+        felt = sqrt(np.sum((motion.velocity / t + front.gravity) ** 2))
+        if felt > _STILL_ACCELERATION + n_sigmas * imu.acceleration_noise:
+            return False
+        turn = float(se3.rotation_angle(motion.T)) / t
+        return turn < _STILL_TURN + n_sigmas * imu.gyro_noise
 
 
 def step_covariance(before: FloatArray, T_step: FloatArray, after: FloatArray) -> FloatArray:

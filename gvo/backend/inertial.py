@@ -22,6 +22,8 @@ _N_START = 15
 # A step contradicts the IMU from so many sigmas on, per degree of freedom; after so many in a row
 # it is the IMU that is wrong.
 _GATE, _N_CONTRADICTIONS = 5.0, 6
+# So long after the newest measured frame nothing is known any more, nanoseconds.
+_FORGOTTEN_NS = 60_000_000_000
 # A camera that moves no faster, m/s, or not more sigmas than this, may be at rest.
 _REST_SPEED, _REST_SIGMAS = 0.02, 3.0
 
@@ -31,8 +33,8 @@ class InertialEstimator:
 
     A Kalman filter, whose state is told in the axes of the IMU at the newest measured frame: only
     motions are measured, and only motions are asked for. Nothing here acts on the window but what
-    `carry` returns. It begins anew where the IMU has a hole, and where steps contradict it one
-    after the other.
+    `carry` returns. It begins anew where the IMU has a hole, where steps contradict it one after
+    the other, and after a minute without any.
 
     Parameters
     ----------
@@ -219,6 +221,9 @@ class InertialEstimator:
     # Afterwards
 
     def _go_on(self, stamp_ns: int, step: Edge | None) -> None:
+        if stamp_ns - self._fronts[0].stamp_ns > _FORGOTTEN_NS:
+            self._restart(stamp_ns, "no frame was registered for a minute")
+            return
         end = self._integrate.advance(self._fronts[-1], stamp_ns)
         if end is None:
             self._restart(stamp_ns, "samples were missing")

@@ -245,6 +245,14 @@ def test_it_starts_after_fifteen_frames_that_follow_each_other() -> None:
     assert ride.ride(1.25).estimator.state is not None
 
 
+def test_a_minute_of_darkness_is_forgotten() -> None:
+    ride = Ride(estimator(), length_s=70.0).ride(2.0).ride(62.0, is_seen=False)
+    assert ride.estimator.n_restarts == 0
+    assert ride.ride(62.1, is_seen=False).estimator.n_restarts == 1
+    assert ride.ride(66.0).carried(1.0)[0] < 0.005
+    assert ride.estimator.n_restarts == 1
+
+
 def test_a_hole_in_the_imu_makes_it_begin_anew() -> None:
     ride = Ride(estimator(), sensor=Sensor(hole_s=(2.0, 2.2)))
     assert ride.ride(2.0).carry(0.1) is None
