@@ -109,14 +109,14 @@ class Motion(NamedTuple):
     Parameters
     ----------
     length_s : float
-    T : ndarray of float64, shape (4, 4)
+    T_start_end : ndarray of float64, shape (4, 4)
         Where the IMU is at its end, in the axes at its start, if it had stood there.
     velocity : ndarray of float64, shape (3,)
         How much faster it is then, in the axes at its start, m/s.
     """
 
     length_s: float
-    T: FloatArray
+    T_start_end: FloatArray
     velocity: FloatArray
 
 
@@ -170,7 +170,7 @@ class Preintegrator:
         """Return a front moved on by what the IMU measured."""
         is_still = self._is_still(front, motion)
         is_resting = front.is_resting and is_still
-        t, step, velocity = motion.length_s, motion.T.copy(), np.zeros(3)
+        t, step, velocity = motion.length_s, motion.T_start_end.copy(), np.zeros(3)
         if is_resting:
             step[:3, 3] = 0.0
         else:
@@ -215,7 +215,7 @@ class Preintegrator:
         felt = sqrt(np.sum((motion.velocity / t + front.gravity) ** 2))
         if felt > _STILL_ACCELERATION + n_sigmas * imu.acceleration_noise:
             return False
-        turn = float(se3.rotation_angle(motion.T)) / t
+        turn = float(se3.rotation_angle(motion.T_start_end)) / t
         return turn < _STILL_TURN + n_sigmas * imu.gyro_noise
 
 

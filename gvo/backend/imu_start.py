@@ -46,7 +46,7 @@ def find_start(
     for motion, step in zip(motions, steps, strict=True):
         if motion is None:
             return Failure(reason="it has no samples at some frames: a hole, or another clock")
-        turned += se3.log(se3.invert(step.T_reference_frame) @ motion.T)[:3]
+        turned += se3.log(se3.invert(step.T_reference_frame) @ motion.T_start_end)[:3]
     biases[:3] = turned / length_s
     motions = [integrate.between(*span, biases) for span in pairwise(stamps_ns)]
     T = [np.eye(4)]
@@ -79,7 +79,7 @@ def _solve(T_world_imu: FloatArray, motions: Sequence[Motion]) -> tuple[FloatArr
         t, R = motion.length_s, T_world_imu[k, :3, :3]
         A[k, 0, :, k], A[k, 0, :, -1] = t * unit, 0.5 * t * t * unit
         A[k, 1, :, k], A[k, 1, :, k + 1], A[k, 1, :, -1] = -unit, unit, -t * unit
-        b[k, 0] = T_world_imu[k + 1, :3, 3] - T_world_imu[k, :3, 3] - R @ motion.T[:3, 3]
+        b[k, 0] = T_world_imu[k + 1, :3, 3] - T_world_imu[k, :3, 3] - R @ motion.T_start_end[:3, 3]
         b[k, 1] = R @ motion.velocity
     A[:, 0], b[:, 0] = A[:, 0] / _POSITION, b[:, 0] / _POSITION
     A[:, 1], b[:, 1] = A[:, 1] / _VELOCITY, b[:, 1] / _VELOCITY
