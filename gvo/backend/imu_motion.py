@@ -19,7 +19,6 @@ import numpy as np
 from gvo.backend.imu_buffer import ImuBuffer
 from gvo.geometry import se3
 from gvo.geometry.imu import GRAVITY, Imu
-from gvo.kernels.inertial import preintegrate
 from gvo.types import Edge, FloatArray
 
 # Data sheets speak of an IMU that lies still: in use its noise is so many times larger.
@@ -131,6 +130,8 @@ class Preintegrator:
 
     def between(self, start_ns: int, end_ns: int, biases: FloatArray) -> Motion | None:
         """Return what was measured between two stamps; None if a hole is in it."""
+        from gvo.kernels.inertial import preintegrate  # loaded where frames are tracked alone
+
         pieces = self._buffer.between(start_ns, end_ns)
         if pieces is None:
             return None
