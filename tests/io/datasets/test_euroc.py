@@ -221,7 +221,8 @@ def test_a_table_of_another_form_is_refused(
 
 def test_a_damaged_sensor_is_refused(tmp_path: Path, tiny: Any) -> None:
     folder = _with_imu(tmp_path / "m", tiny, accelerometer_random_walk=0.0)
-    with pytest.raises(CalibrationError, match="accelerometer_random_walk must be positive and at most 10, got 0"):
+    expected = "accelerometer_random_walk must be positive and at most 10, got 0"
+    with pytest.raises(CalibrationError, match=expected):
         open_recording(folder)
 
 
