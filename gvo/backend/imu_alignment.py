@@ -147,15 +147,18 @@ class _Solved(NamedTuple):
     differences: FloatArray
 
 
-class _Fit:
-    """Rates of gyro and camera over the same spans, for any delay."""
+class _Fit(NamedTuple):
+    """Rates of gyro and camera over the same spans, for any delay.
 
-    def __init__(
-        self, spans_s: FloatArray, seen: FloatArray, stamps_s: FloatArray, angles: FloatArray
-    ) -> None:
-        self._spans_s, self._seen = spans_s, seen
-        self._stamps_s, self._angles = stamps_s, angles
-        self.R: FloatArray | None = None
+    `seen` (n, 3) are those of the camera, rad/s, `angles` (m, 3) what the gyro adds up to, rad. `R`
+    is the rotation, if it is known.
+    """
+
+    spans_s: FloatArray
+    seen: FloatArray
+    stamps_s: FloatArray
+    angles: FloatArray
+    R: FloatArray | None
 
     @classmethod
     def of(
@@ -175,18 +178,16 @@ class _Fit:
         angles = np.zeros_like(gyro)
         means = 0.5 * (gyro[1:] + gyro[:-1])
         np.cumsum(means * np.diff(stamps_s)[:, np.newaxis], axis=0, out=angles[1:])
-        fit = cls(spans_s, rates, stamps_s, angles)
-        fit.R = R
-        return fit
+        return cls(spans_s, rates, stamps_s, angles, R)
 
     def _rates(self, delay_s: float) -> FloatArray:
         """Return mean rates (n, 3) of the gyro over the spans."""
-        at_s = self._spans_s - delay_s
-        angles = [np.interp(at_s, self._stamps_s, column) for column in self._angles.T]
+        at_s = self.spans_s - delay_s
+        angles = [np.interp(at_s, self.stamps_s, column) for column in self.angles.T]
         return np.stack([np.diff(each, axis=1)[:, 0] for each in angles], axis=1) / np.diff(at_s)
 
     def _solve(self, delay_s: float) -> _Solved:
-        rates, seen = self._rates(delay_s), self._seen
+        rates, seen = self._rates(delay_s), self.seen
         sizes = np.linalg.norm(self._solve_all(rates, seen).differences, axis=1)
         is_good = sizes <= _OUTLIER * np.median(sizes)
         return self._solve_all(rates[is_good], seen[is_good])

@@ -68,8 +68,8 @@ class Front:
     @property
     def up(self) -> tuple[FloatArray, float]:
         """The unit vector (3,) against gravity, and its sigma, rad."""
-        up = -self.gravity / np.linalg.norm(self.gravity)
-        J = se3.skew(up) / np.linalg.norm(self.gravity)
+        up = -self.gravity / GRAVITY
+        J = se3.skew(up) / GRAVITY
         return up, float(np.sqrt((J @ self.covariance[15:, 15:] @ J.T).diagonal().max()))
 
     @property

@@ -63,20 +63,20 @@ class InertialEstimator:
         self._audit = _Audit()
         self._n_contradictions = 0
         self.n_restarts = self.carried_ns = 0
-        self.reason = "the camera has not turned enough to learn how it sits and how late it is"
-        self._alignment: Alignment | None = None
-        self.imu = imu
-        if imu.T_camera_imu is None or imu.delay_s is None:
-            self._alignment = Alignment(imu)
-        else:
-            self._place(imu)
+        self._place(imu)
         self._begin()
 
     def _place(self, imu: Imu) -> None:
+        """Take the IMU where it is and as late as it is, or begin to learn that."""
         self.imu = imu
+        self._alignment: Alignment | None = None
+        if imu.T_camera_imu is None or imu.delay_s is None:
+            self._alignment = Alignment(imu)
+            self.reason = "the camera has not turned enough to learn how it sits and how late it is"
+            return
         self.reason = f"no {_N_START} frames in a row could be registered"
-        self._T_camera_imu = np.eye(4) if imu.T_camera_imu is None else imu.T_camera_imu
-        self._buffer.delay_ns = round(1e9 * (imu.delay_s or 0.0))
+        self._T_camera_imu = imu.T_camera_imu
+        self._buffer.delay_ns = round(1e9 * imu.delay_s)
 
     def _begin(self) -> None:
         # Frames registered one after the other, with the steps that lead to them: until it starts.
@@ -188,7 +188,6 @@ class InertialEstimator:
             self._buffer.drop(alignment.oldest_ns(stamp_ns))
             return
         _LOGGER.info("the IMU is %s", found)
-        self._alignment = None
         self._place(found)
         for ns, each in alignment.steps[-_N_START:]:
             self._wait(ns, self._of_imu(each))

@@ -118,7 +118,7 @@ class RunLoop:
         )
         self.imu_until: Callable[[int], Iterator[ImuSamples]] | None = None
         if stream is not None:
-            self.imu_until = ImuFeed(stream.samples, delay_s=1e-9 * self.imu_delay_ns).until
+            self.imu_until = ImuFeed(stream.samples, delay_ns=self.imu_delay_ns).until
 
     @property
     def window(self) -> SlidingWindow:
@@ -344,14 +344,14 @@ class ImuFeed:
     ----------
     samples : callable
         As of `ImuStream`.
-    delay_s : float
+    delay_ns : int
         Of the IMU, as far as it is known.
     """
 
     def __init__(
-        self, samples: Callable[[int], Iterator[ImuSamples]], *, delay_s: float = 0.0
+        self, samples: Callable[[int], Iterator[ImuSamples]], *, delay_ns: int = 0
     ) -> None:
-        self._open, self._delay_ns = samples, round(1e9 * delay_s)
+        self._open, self._delay_ns = samples, delay_ns
         self._samples: Iterator[ImuSamples] | None = None
         self._last_ns: int | None = None
 

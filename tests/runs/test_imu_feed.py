@@ -51,7 +51,7 @@ def test_samples_come_once_in_order_until_some_are_later_than_the_frame(
             n_read += 1
             yield batch(stamps_ns)
 
-    feed, taken = ImuFeed(read, delay_s=1e-9 * delay_ns), []
+    feed, taken = ImuFeed(read, delay_ns=delay_ns), []
     for stamp_ns in range(first_ns, 3_000_000_000, frame_ns):
         for samples in feed.until(stamp_ns + delay_ns):
             assert len(samples) > 0
